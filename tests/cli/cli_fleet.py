@@ -74,7 +74,7 @@ class CliFleet:
     ) -> subprocess.CompletedProcess[str]:
         """Runs a command again until what came of it is so. One that asks for devices has a process of its own: signals
         are for it, and its children write to its streams. All others run here: a process takes 0.3 s to begin."""
-        if {"request", "take"} & {*args} and "--dry-run" not in args:
+        if {"request", "take", "acquire", "run"} & {*args} and "--dry-run" not in args:
             return tools.zscout_until(condition, *args, env=self.lab.env, stdin=stdin)
         began = time.monotonic()
         while True:

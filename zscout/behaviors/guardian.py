@@ -1,6 +1,6 @@
 """Guards a command that holds devices, as that of `zscout request`: run as a program beside the client.
 
-    python -I -S guardian.py CHANNEL TTY GRACE COMMAND [ARG]...
+    python -I -S guardian.py CHANNEL[,KEPT] TTY GRACE COMMAND [ARG]...
 
 It starts COMMAND in a process group of its own, gives it the terminal (TTY, an open descriptor, or -1), and is the
 subreaper of all that comes of it: whoever of its descendants loses its parent becomes a child of the guardian, so that
@@ -14,8 +14,9 @@ before the guardian starts), `end NS` (the grace counts from then), `kill` (with
 COMMAND alone; negative: by that signal), `stuck PID` (it runs as another user, and can't be ended; 0: /proc shows no
 process, and something lives), `gone`.
 
-Where the client can't, being gone or frozen, the guardian becomes the program that tells the RCs that all is gone. It
-imports nothing of zscout itself, to start quickly.
+Where the client can't, being gone or frozen, the guardian becomes the program that tells the RCs that all is gone; not
+with KEPT, a descriptor that it keeps open until all is gone: its other end tells them, which may have more commands
+under that hold. The guardian imports nothing of zscout itself, to start quickly.
 """
 
 from __future__ import annotations
@@ -411,13 +412,15 @@ def main() -> None:
             os.fstat(fd)
         except OSError:
             os.set_inheritable(os.open(os.devnull, os.O_RDWR), True)  # the lowest number that is free
-    channel, tty, grace, command = int(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3]), sys.argv[4:]
-    os.set_inheritable(channel, False)
+    (channel, *kept), tty, grace = map(int, sys.argv[1].split(",")), int(sys.argv[2]), int(sys.argv[3])
+    command = sys.argv[4:]
+    for fd in (channel, *kept):
+        os.set_inheritable(fd, False)
     connection = socket.socket(fileno=channel)
     connection.setblocking(False)
     guardian = Guardian(connection, grace)
     guardian.run(tty, command)
-    if guardian.speaks:
+    if guardian.speaks and not kept:
         os.execv(LEFT[0], LEFT)  # noqa: S606 - an interpreter of our own
 
 

@@ -30,6 +30,9 @@ from zscout.streams import escape_what_cannot_be_written
 HEADINGS: Final[Headings] = {
     "Use devices": {
         "request": ("cli.requests.request:request", "Wait for devices; hold them, or run a command that needs them."),
+        "acquire": ("cli.requests.acquire:acquire", "Hold devices for the commands that follow; print a token."),
+        "renew": ("cli.requests.acquire:renew", "Hold the devices of a token for longer."),
+        "run": ("cli.requests.acquire:run", "Run a command under the hold of a token."),
         "take": ("cli.operator.take:take", "Take devices at an operator's priority, preempting their holders."),
         "drive": ("cli.operator.drive:drive", "Take a robot and drive it from the keyboard, seeing what it sees."),
         "release": ("cli.requests.cancel:release", "End the hold of a request; leave what waits alone."),
@@ -78,8 +81,8 @@ OLD: Final = {
 """What to write instead of old spellings."""
 HABITS: Final = """
 status = ps list ls queue squeue sinfo who show info jobs stat state devices nodes hosts; status --watch = top htop
-request = lock acquire hold get grab claim alloc allocate salloc ask wait checkout submit
-request DEVICE -- COMMAND = run exec srun sbatch; book = reserve schedule; take = preempt steal seize takeover
+request = lock hold get grab claim alloc allocate salloc ask wait checkout submit
+request DEVICE -- COMMAND = exec srun sbatch; book = reserve schedule; take = preempt steal seize takeover
 release = unlock free return give drop yield; cancel = kill scancel abort end rm delete remove
 component logs = log output tail; component migrate = move mv; component kinds = kinds types
 why = explain reason; view = timeline viewer gui ui rerun; view --web = web dashboard

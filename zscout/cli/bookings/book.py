@@ -52,8 +52,7 @@ from zscout.cli.dates import (
     span_words,
 )
 from zscout.cli.ownership import User, yes_option
-from zscout.cli.requests.options import Needs, gather_needs, parse_comment, parse_duration, parse_need
-from zscout.cli.requests.request import MAX_PRIORITY
+from zscout.cli.requests.options import MAX_PRIORITY, Needs, gather_needs, parse_comment, parse_duration, parse_need
 from zscout.config.strict import BadInput, quoted
 from zscout.keyexpr import check_name, check_need, host_in, is_pattern, of_host, valid_name
 from zscout.messages import MAX_AHEAD, WINDOW, BookingRecord, BookingsTold, BookingView, Who

@@ -28,8 +28,7 @@ from zscout.cli.bookings.calendar_file import MAX_BYTES, read_calendar
 from zscout.cli.bookings.calendar_plan import ImportOptions, ImportPlan, Pairs, Wanted, plan_import
 from zscout.cli.common import Failed, NobodyThere, Parsed
 from zscout.cli.dates import date_words, every_words, host_zone
-from zscout.cli.requests.options import gather_needs, parse_duration, parse_need
-from zscout.cli.requests.request import MAX_PRIORITY
+from zscout.cli.requests.options import MAX_PRIORITY, gather_needs, parse_duration, parse_need
 from zscout.config.state_folder import write_durably
 from zscout.config.strict import BadInput, quoted, read_bytes
 from zscout.keyexpr import Role, check_rc, host_in, is_pattern

@@ -15,8 +15,7 @@ from zscout.cli import common
 from zscout.cli.booked import ask_bookings, explained, in_words, utc, zone_option
 from zscout.cli.bookings.book import DATE, DURATION, needs_argument
 from zscout.cli.dates import WrittenDate, date_words, host_zone
-from zscout.cli.requests.options import gather_needs, seconds_within
-from zscout.cli.requests.request import MAX_PRIORITY
+from zscout.cli.requests.options import MAX_PRIORITY, gather_needs, seconds_within
 from zscout.messages import MAX_AHEAD, MAX_SLOTS, SlotsTold
 from zscout.terminal import Table, span
 

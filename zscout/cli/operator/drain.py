@@ -23,8 +23,7 @@ from zscout.cli import common
 from zscout.cli.booked import ask_bookings, explained, free_name, is_own, maintenance_of
 from zscout.cli.components import placing
 from zscout.cli.ownership import User
-from zscout.cli.requests.options import parse_comment, timeout_option
-from zscout.cli.requests.request import MAX_PRIORITY
+from zscout.cli.requests.options import MAX_PRIORITY, parse_comment, timeout_option
 from zscout.cli.requests.waiting import hold_json, request_words
 from zscout.keyexpr import of_host
 from zscout.messages import WINDOW, DrainHost, Grants, HoldView, Placement, Placements, UncordonHost, Who

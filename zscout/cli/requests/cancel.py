@@ -10,6 +10,7 @@ from zscout import terminal
 from zscout.behaviors.client.client import TRY_AGAIN, Client
 from zscout.cli import common
 from zscout.cli.ownership import User, ask_for_others, whose, yes_option
+from zscout.cli.requests.acquire import release_token
 from zscout.cli.requests.options import arc_argument
 from zscout.config.strict import quoted
 from zscout.keyexpr import USERS, check_name, client_of
@@ -52,17 +53,28 @@ async def cancel(arc: str, every: bool, yes: bool, as_json: bool) -> None:
 @common.json_option("Print one JSON object.")
 @common.runs
 async def release(arc: str, every: bool, yes: bool, as_json: bool) -> None:
-    """End the hold of a request: by name, id, or <host>/<client>/<id>.
+    """End the hold of a request: by name, id, or <host>/<client>/<id>; or by the token of `zscout acquire`.
 
     The same as `zscout cancel`, with the same question, but it leaves a waiting request alone. If several requests
-    have the name, it is refused, unless --all is given.
+    have the name, it is refused, unless --all is given. With a token it ends the commands that run under it first,
+    and it is no failure if the hold has ended.
 
     \b
     Examples:
       zscout release survey
+      zscout release $TOKEN
       zscout release anvil/request-5f0c2a9d13be/0b1d3c5e7f90 --json
     """
-    await _end(arc, "release", every=every, yes=yes, as_json=as_json)
+    if (held := await release_token(arc)) is None:
+        await _end(arc, "release", every=every, yes=yes, as_json=as_json)
+        return
+    target, outcome = Target(held.arc, held.id, held.client, "ended" if held.ended else "running"), "released"
+    if as_json:
+        found = {name: getattr(target, name) for name in ("arc", "id", "client", "was")}
+        terminal.print_json({"op": "release", "arcs": [found | {"state": "ended", "outcome": outcome}]})
+    else:
+        word = f"has ended: {held.ended}" if held.ended else f"was {target.was}: {outcome}"
+        terminal.print_line(terminal.clean(f"{target.arc} ({target.full_name}) {word}"))
 
 
 class Target(NamedTuple):

@@ -33,8 +33,9 @@ Needs = dict[str, dict[str, Decimal]]
 
 INFRA_EXIT: Final = "--infra-exit"
 EXIT_CODES: Final = range(1, 256)
-DEFAULT_NAMES: Final = ("request", "operator")
-"""What ARCs of `zscout request` and `zscout take` are called that run no command."""
+MAX_PRIORITY: Final = 1_000_000
+DEFAULT_NAMES: Final = ("request", "operator", "acquire")
+"""What ARCs of `zscout request`, `take` and `acquire` are called that run no command."""
 MAX_ARC_NAME: Final = 200
 """Characters of `<host>/<client>/<id>`, the longest name of an ARC."""
 _NUMBER: Final = re.compile(r"[0-9]{1,19}(\.[0-9]{1,18})?|\.[0-9]{1,18}")
@@ -149,13 +150,18 @@ def gather_needs(pairs: Sequence[tuple[str, dict[str, Decimal]]]) -> Needs:
 # Commands that hold something
 
 
+def is_descriptor(target: str) -> bool:
+    return target.isascii() and target.isdigit()
+
+
 class EventFile:
     """Where `--json-file` writes events: a file, a FIFO with a reader, or an open descriptor."""
 
     def __init__(self, target: str) -> None:
         """Raises BadInput where nothing can be written there."""
+        self.given = is_descriptor(target)
         try:
-            if target.isascii() and target.isdigit():
+            if self.given:
                 self.fd = int(target)
                 os.fstat(self.fd)
             else:
@@ -166,6 +172,11 @@ class EventFile:
         except (OSError, OverflowError) as error:
             why = error.strerror if isinstance(error, OSError) else "no such descriptor"
             raise BadInput(f"--json-file {quoted(target)} can't be written ({why}); give another file") from None
+
+    def close_given(self) -> None:
+        """Close a descriptor that was given: its reader waits for the end."""
+        if self.given:
+            os.close(self.fd)
 
     def write(self, event: Mapping[str, Any]) -> None:
         """Write one event as a line. What zscout does does not depend on who reads it."""
@@ -178,6 +189,7 @@ class HoldCommand(click.Command):
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         ctx.meta["infra_exit"] = _infra_exit_in(args)
+        ctx.meta.setdefault("command", ())
         with _own_failures(ctx):
             return super().parse_args(ctx, args)
 
@@ -200,13 +212,13 @@ def _infra_exit_in(args: Sequence[str]) -> int | None:
 @contextmanager
 def _own_failures(ctx: click.Context) -> Iterator[None]:
     """Write a failure to --json-file, and raise InfraExit for it, where these options are given."""
-    from zscout.cli.main import explain
-
     try:
         yield
     except (click.exceptions.Exit, click.Abort, Interrupted):
         raise
     except Exception as error:
+        from zscout.cli.main import explain
+
         code, line = explain(error) or (1, repr(error))
         if (events := ctx.meta.get("events")) is not None:
             events.write({"event": "failed", "code": code, "reason": line.removeprefix("zscout: ")})
@@ -256,6 +268,8 @@ class HoldOptions:
     """The id of the booking that it takes up."""
     infra_exit: int | None = None
     events: EventFile | None = None
+    direct: bool = False
+    """Whether programs touch the devices past zscout; those of a command do."""
 
     def own_code(self, code: int) -> int:
         """The exit code where it is zscout's own that would be `code`."""
@@ -273,8 +287,23 @@ class HoldOptions:
         return terms | {"wait_for_device": self.wait_for_device}
 
 
-def hold_options(command: F, *, needs_required: bool = True) -> F:
-    """The NEEDs and the options of all commands that hold something."""
+def hold_options(command: F, *, needs_required: bool = True, runs_command: bool = True) -> F:
+    """The NEEDs and the options of commands that hold something; `runs_command`: those that may run a command too."""
+    of_commands = (
+        click.option("--again", is_flag=True, help="Repeat request and command if the devices were taken away."),
+        click.option(
+            "--release-after",
+            type=Parsed("duration", parse_duration),
+            help="Give the devices back after this time, even if nobody waits; instead of --min-runtime.",
+        ),
+        grace_option,
+        click.option(
+            "--min-runtime",
+            type=Parsed("duration", parse_duration),
+            help="Protect the hold this long from requests of equal priority: 90s, 5m, 2h, 1d12h. Default: the "
+            "fleet's, 60 s.",
+        ),
+    )
     for option in (
         click.argument(
             "needs",
@@ -286,24 +315,8 @@ def hold_options(command: F, *, needs_required: bool = True) -> F:
         ),
         json_option("Print JSON lines, one for each event."),
         click.option("--wait-for-device", is_flag=True, help="Wait for devices that are unknown, too."),
-        click.option("--again", is_flag=True, help="Repeat request and command if the devices were taken away."),
-        click.option(
-            "--release-after",
-            type=Parsed("duration", parse_duration),
-            help="Give the devices back after this time, even if nobody waits; instead of --min-runtime.",
-        ),
-        click.option(
-            "--grace",
-            type=Parsed("duration", partial(parse_duration, zero=True)),
-            help="Time from SIGTERM to SIGKILL for the command: at most, and by default, nine tenths of what devices "
-            "settle (`settle`, 5 s).",
-        ),
-        click.option(
-            INFRA_EXIT,
-            type=click.IntRange(EXIT_CODES[0], EXIT_CODES[-1]),
-            metavar="N",
-            help="Exit with N wherever zscout fails, not the command: for 1, 2, 3, 75 and 124.",
-        ),
+        *(of_commands if runs_command else ()),
+        infra_exit_option,
         click.option(
             "--json-file",
             metavar="PATH|FD",
@@ -311,21 +324,49 @@ def hold_options(command: F, *, needs_required: bool = True) -> F:
         ),
         timeout_option("Wait this long for a grant, then exit with 1; 0: try once.", zero=True),
         click.option(
-            "--min-runtime",
-            type=Parsed("duration", parse_duration),
-            help="Protect the hold this long from requests of equal priority: 90s, 5m, 2h, 1d12h. Default: the "
-            "fleet's, 60 s.",
-        ),
-        click.option(
             "--comment",
             type=Parsed("text", parse_comment),
             default="",
             help="A comment, shown in status and to requests that wait for the devices.",
         ),
-        click.option("--name", help="Name of the request. Default: the command's name, else request (take: operator)."),
+        click.option(
+            "--name", help=f"Name of the request. Default: {NAMES_OF_COMMANDS if runs_command else DEFAULT_NAMES[2]}."
+        ),
     ):
         command = option(command)
     return command
+
+
+NAMES_OF_COMMANDS: Final = "the command's name, else request (take: operator)"
+grace_option: Final = click.option(
+    "--grace",
+    type=Parsed("duration", partial(parse_duration, zero=True)),
+    help="Time from SIGTERM to SIGKILL for the command: at most, and by default, nine tenths of what devices settle "
+    "(`settle`, 5 s).",
+)
+infra_exit_option: Final = click.option(
+    INFRA_EXIT,
+    type=click.IntRange(EXIT_CODES[0], EXIT_CODES[-1]),
+    metavar="N",
+    help="Exit with N wherever zscout fails, not the command: for 1, 2, 3, 75 and 124.",
+)
+priority_option: Final = click.option(
+    "--priority",
+    type=click.IntRange(-MAX_PRIORITY, MAX_PRIORITY),
+    default=0,
+    help="Higher priorities preempt lower ones.",
+)
+tolerate_option: Final = click.option(
+    "--tolerate", type=SECONDS, help="Keep a device that stops working, as in a reboot, for this long each time."
+)
+
+
+def grace_within(asked: Decimal | None, most: float) -> tuple[float, str]:
+    """The grace, and what people are told where it is less than what was asked for."""
+    if asked is None or asked <= most:
+        return most if asked is None else float(asked), ""
+    text = f"--grace {span(float(asked))} is more than the devices allow: SIGKILL follows {span(most)} after SIGTERM"
+    return most, text
 
 
 def gather(

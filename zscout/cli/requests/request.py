@@ -23,7 +23,16 @@ from zscout.cli.booked import BOOKING
 from zscout.cli.common import Failed
 from zscout.cli.device_words import unwell
 from zscout.cli.ownership import yes_option
-from zscout.cli.requests.options import SECONDS, CommandAfterDashes, EventFile, HoldOptions, gather, hold_options
+from zscout.cli.requests.options import (
+    CommandAfterDashes,
+    EventFile,
+    HoldOptions,
+    gather,
+    grace_within,
+    hold_options,
+    priority_option,
+    tolerate_option,
+)
 from zscout.cli.requests.run_command import RunningCommand, environment
 from zscout.cli.requests.taking_up import check_options, taking_up
 from zscout.cli.requests.waiting import NeedContention, contention_of, hold_text, reason_text, request_words
@@ -38,7 +47,6 @@ TAKEN_AWAY: Final = 75
 """EX_TEMPFAIL: the grant was taken from the command; it may be tried again."""
 TIME_OVER: Final = 124
 """As `timeout` has it: the command was ended because its time was over, and with a kept hold somebody waited."""
-MAX_PRIORITY: Final = 1_000_000
 ANSWERS: Final = 5.0
 """Seconds in which a leader answers, or the next one leads and does, with --timeout 0."""
 UNDECIDED: Final = (ReasonCode.VOTING, ReasonCode.SEARCHING)
@@ -51,17 +59,10 @@ REFRESH: Final = 1.0
 
 
 @click.command(cls=CommandAfterDashes)
-@click.option(
-    "--priority",
-    type=click.IntRange(-MAX_PRIORITY, MAX_PRIORITY),
-    default=0,
-    help="Higher priorities preempt lower ones.",
-)
+@priority_option
 @click.option("--keep", is_flag=True, hidden=True, help="What happens without it as well.")
 @click.option("--booking", type=BOOKING, shell_complete=completion.bookings, help="Use this booking: its name or id.")
-@click.option(
-    "--tolerate", type=SECONDS, help="Keep a device that stops working, as in a reboot, for this long each time."
-)
+@tolerate_option
 @yes_option
 @click.option("--dry-run", is_flag=True, help="Only print when it would start, and what it would preempt.")
 @partial(hold_options, needs_required=False)
@@ -143,7 +144,7 @@ async def carry_out(client: Client, wanted: HoldOptions) -> int:
         arc: OpenArc | None = None
         while True:
             try:
-                arc = await _wait(client, wanted, report, arc if arc is not None and arc.open else None)
+                arc = await wait_for_grant(client, wanted, report, arc if arc is not None and arc.open else None)
                 code = await _use(client, wanted, report, arc)
             except CommandRefused as refused:
                 # A device did not know of the grant: the client has given it back.
@@ -157,7 +158,7 @@ async def carry_out(client: Client, wanted: HoldOptions) -> int:
                 return code
 
 
-async def _wait(client: Client, wanted: HoldOptions, report: Report, arc: OpenArc | None) -> OpenArc:
+async def wait_for_grant(client: Client, wanted: HoldOptions, report: Report, arc: OpenArc | None) -> OpenArc:
     """Until it is granted. Raises Failed where it is not."""
     try:
         once = wanted.timeout == 0
@@ -169,7 +170,7 @@ async def _wait(client: Client, wanted: HoldOptions, report: Report, arc: OpenAr
                     **wanted.terms(),
                     comment=wanted.comment,
                     estimate=True,
-                    direct=bool(wanted.command),
+                    direct=wanted.direct or bool(wanted.command),
                     booking=wanted.booking,
                 )
             async with common.beside(_give_up_once_queued(client, arc, limit)) if once else nullcontext():
@@ -208,14 +209,14 @@ async def _use(client: Client, wanted: HoldOptions, report: Report, arc: OpenArc
     if grant is None:  # taken away since the RCs confirmed it
         return await _taken(client, wanted, report, arc)
     held = Held(client, arc, grant)
-    rcs, left, longest = _held_text(held), held.remaining, client.fleet.scheduling.max_runtime
+    rcs, left, longest = held_text(held), held.remaining, client.fleet.scheduling.max_runtime
     details = {"id": arc.id, "rcs": held.rcs, "bound": held.bound, "keep": arc.keep}
     details |= {"grant": grant, "remaining": round(left, 3)}
     report.event("granted", f"{arc.name} holds {rcs}: {_yours(arc, left, longest)}", **details)
     try:
         code = None
         if wanted.tolerate is not None:
-            await _tolerate(wanted.tolerate, report, held)
+            await tolerate(wanted.tolerate, report, held)
         with _reporting_unwell(report, held, client):
             if wanted.command:
                 code = await _run(wanted, report, held, client)
@@ -234,7 +235,7 @@ async def _use(client: Client, wanted: HoldOptions, report: Report, arc: OpenArc
     if held.active:
         # By our clock its time is over; the RCM's own word is on its way.
         await common.until(lambda: not held.active, report.changed, LAST_WORD)
-    ending = _ending(arc)
+    ending = ending_of(arc)
     if held.active or ending.outcome == "completed":
         why = ending.reason if arc.keep else "its time is over"
         ended_by_hand = arc.why is not None and arc.why.code == "released"
@@ -249,7 +250,7 @@ async def _use(client: Client, wanted: HoldOptions, report: Report, arc: OpenArc
     return await _taken(client, wanted, report, arc)
 
 
-async def _tolerate(seconds: float, report: Report, held: Held) -> None:
+async def tolerate(seconds: float, report: Report, held: Held) -> None:
     tolerated = await held.expect_outage(seconds, each=True)
     if less := {rc: most for rc, most in tolerated.items() if most < seconds}:
         words = ", ".join(f"{rc} tolerates {span(most) if most else 'no outage'}" for rc, most in less.items())
@@ -310,7 +311,7 @@ async def _run(wanted: HoldOptions, report: Report, held: Held, client: Client) 
                 if held.active:
                     await client.end(held.arc)
                 return await command.wait()
-            why = "its time is over" if held.active else _ending(held.arc).reason or "the grant is gone"
+            why = "its time is over" if held.active else ending_of(held.arc).reason or "the grant is gone"
             report.event("stopping", f"{program} is stopped: {why}", reason=why)
     finally:
         if direct is not None and command.gone:
@@ -338,18 +339,15 @@ async def _tell_who_is_old(report: Report, held: Held, client: Client, direct: D
 def _grace(wanted: HoldOptions, report: Report, direct: DirectHold | None) -> float:
     """Seconds from SIGTERM to SIGKILL: no more than the RCs wait."""
     most = float((direct.grace if direct is not None else DEFAULT_SETTLE) / SECOND)
-    if wanted.grace is None:
-        return most
-    asked = float(wanted.grace)
-    if asked > most:
-        text = f"--grace {span(asked)} is more than the devices allow: SIGKILL follows {span(most)} after SIGTERM"
-        report.event("grace", text, asked=asked, grace=most)
-    return min(asked, most)
+    grace, text = grace_within(wanted.grace, most)
+    if text:
+        report.event("grace", text, asked=float(wanted.grace or 0), grace=grace)
+    return grace
 
 
 async def _taken(client: Client, wanted: HoldOptions, report: Report, arc: OpenArc) -> int | None:
     """The grant was taken away. Raises Failed where there is no command and no second try."""
-    ending = _ending(arc)
+    ending = ending_of(arc)
     # What lost an RC after its minimum runtime is not queued again.
     again = wanted.again and (arc.open or ending.outcome == "lost")
     line = f"{arc.name} lost its grant: {ending.reason or ending.outcome}"
@@ -376,7 +374,7 @@ def _kept(longest: Ns | None) -> str:
     return UNTIL if longest is None else f"{UNTIL}, {span(longest / SECOND)} in all at most"
 
 
-def _ending(arc: OpenArc) -> HoldEnd:
+def ending_of(arc: OpenArc) -> HoldEnd:
     return arc._ending or HoldEnd("lost", "")
 
 
@@ -487,7 +485,7 @@ class Report(LiveLine):
             protected = left > 0 or not arc.keep
             rest = _yours(arc, left, longest) if protected else f"for {span(self._since(arc))}, {_kept(longest)}"
             rest = rest if arc.ready is None else starting((arc.ready - now) / SECOND)
-            self.draw(f"{arc.name} holds {_held_text(arc)}: {rest}\n  Ctrl-C gives back")
+            self.draw(f"{arc.name} holds {held_text(arc)}: {rest}\n  Ctrl-C gives back")
             await done_within(REFRESH if self.watched else None, self.changed.wait())
 
     def _show_wait(self, arc: OpenArc) -> None:
@@ -530,10 +528,10 @@ class Report(LiveLine):
     def _show_settling(self, arc: OpenArc) -> None:
         ready_in = None if arc.ready is None else round(max(0, arc.ready - self._mesh.now()) / SECOND, 3)
         why = arc.reason if ready_in is None else starting(ready_in)
-        self.draw(f"{arc.name} is granted {_held_text(arc)}, and waits {span(self._since(arc))}: {why}")
+        self.draw(f"{arc.name} is granted {held_text(arc)}, and waits {span(self._since(arc))}: {why}")
         if self._printed != arc.grant:
             self._printed = arc.grant
-            text = "" if self.watched else f"{arc.name} is granted {_held_text(arc)}, and waits: {why}"
+            text = "" if self.watched else f"{arc.name} is granted {held_text(arc)}, and waits: {why}"
             details = {"grant": arc.grant, "reason": why, "ready_in": ready_in}
             self.event("settling", text, id=arc.id, rcs=arc.rcs, **details)
 
@@ -545,7 +543,7 @@ def _how(arc: OpenArc) -> object:
     return arc.state, arc.reason, arc.ahead
 
 
-def _held_text(held: OpenArc | Held) -> str:
+def held_text(held: OpenArc | Held) -> str:
     """What is held, and for which pattern: `framegrabber/fgrab1 for framegrabber/*, robot/a`."""
     met = {rc: need for need, rc in held.bound.items()}
     return ", ".join(f"{rc} for {met[rc]}" if rc in met else rc for rc in sorted(held.rcs))

@@ -53,6 +53,10 @@ def check_command(command: Sequence[str]) -> None:
 
 def environment(held: Held, client: Client) -> dict[str, str]:
     """This process's environment, and what a command needs to use what it holds."""
+    return os.environ | hold_variables(held, client)
+
+
+def hold_variables(held: Held, client: Client) -> dict[str, str]:
     variables = {
         "ZSCOUT_ARC": held.arc.name,
         "ZSCOUT_ARC_ID": held.arc.id,
@@ -65,17 +69,25 @@ def environment(held: Held, client: Client) -> dict[str, str]:
     }
     if (file := fleet_file()) is not None:
         variables["ZSCOUT_FLEET"] = str(file.absolute())
-    return os.environ | variables
+    return variables
 
 
 class RunningCommand:
     """A command from its start to the end of the last process that came of it. Use as an async context manager:
     whatever happens in the body, nothing of it is left afterwards.
 
-    `grace` in seconds, `until` as `hold_until` has it."""
+    `grace` in seconds, `until` as `hold_until` has it; `kept`: a descriptor that its guardian keeps open until then."""
 
-    def __init__(self, command: Sequence[str], env: Mapping[str, str], grace: float, until: Ns | None = None) -> None:
+    def __init__(
+        self,
+        command: Sequence[str],
+        env: Mapping[str, str],
+        grace: float,
+        until: Ns | None = None,
+        kept: int | None = None,
+    ) -> None:
         self._command, self._env, self._grace = list(command), env, grace
+        self._kept = () if kept is None else (kept,)
         self._loop = asyncio.get_running_loop()
         self._gone: asyncio.Future[None] = self._loop.create_future()
         self._tty = _Terminal()
@@ -101,10 +113,16 @@ class RunningCommand:
         theirs, tty = self._theirs.fileno(), self._tty.fd if self._tty.ours_to_give() else -1
         try:
             self._process: subprocess.Popen[Any] = subprocess.Popen(  # noqa: S603, ASYNC220 - returns at once
-                [*GUARD, str(theirs), str(tty), str(round(self._grace * SECOND)), *self._command],
+                [
+                    *GUARD,
+                    ",".join(map(str, (theirs, *self._kept))),
+                    str(tty),
+                    str(round(self._grace * SECOND)),
+                    *self._command,
+                ],
                 env=dict(self._env),
                 process_group=0,
-                pass_fds=(theirs,) if tty < 0 else (theirs, tty),
+                pass_fds=(theirs, *self._kept) if tty < 0 else (theirs, *self._kept, tty),
             )
         except OSError as error:
             self._close()

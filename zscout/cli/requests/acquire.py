@@ -1,0 +1,354 @@
+"""`zscout acquire`, `run` and `renew`: a hold that lasts over several commands, by its token."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import socket
+import subprocess
+import sys
+from contextlib import suppress
+from decimal import Decimal
+from functools import partial
+from pathlib import Path
+from typing import Any, Final
+
+import click
+import msgspec
+
+from zscout.behaviors.guardian import now
+from zscout.cli import common
+from zscout.cli.common import Failed, Parsed, json_option
+from zscout.cli.requests import token_files
+from zscout.cli.requests.options import (
+    DEFAULT_NAMES,
+    CommandAfterDashes,
+    HoldCommand,
+    HoldOptions,
+    gather,
+    grace_option,
+    grace_within,
+    hold_options,
+    infra_exit_option,
+    is_descriptor,
+    parse_duration,
+    priority_option,
+    tolerate_option,
+)
+from zscout.cli.requests.request import TAKEN_AWAY
+from zscout.cli.requests.run_command import RunningCommand, check_command
+from zscout.cli.requests.token_files import Channel, FromHolder, Granted, ToHolder, TokenFile
+from zscout.config.strict import BadInput, quoted
+from zscout.terminal import clean, clock, print_json, print_line, span
+
+ANSWERS: Final = 10.0
+"""Seconds in which a holder process answers."""
+GIVES_BACK: Final = 60.0
+"""Seconds in which one ends the commands and gives back."""
+HOLDER_ENDS: Final = 10.0
+"""Seconds in which one ends that is not needed any more."""
+for_option: Final = click.option(
+    "--for",
+    "span_",
+    required=True,
+    type=Parsed("duration", parse_duration),
+    help="Hold for at most this long: 30m, 2h.",
+)
+
+
+def _tokens(_ctx: click.Context, _param: click.Parameter, incomplete: str) -> list[str]:
+    """What is offered at Tab."""
+    return [token for token in token_files.tokens() if token.startswith(incomplete)]
+
+
+token_argument: Final = click.argument("token", metavar="TOKEN", shell_complete=_tokens)
+
+
+class AcquireCommand(HoldCommand):
+    """It starts itself once more, with the same arguments."""
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        if "--" in args:
+            raise click.UsageError("acquire runs no command; write zscout run TOKEN -- COMMAND after it", ctx)
+        ctx.meta["args"] = tuple(args)
+        return super().parse_args(ctx, args)
+
+
+@click.command(cls=AcquireCommand)
+@click.option("--starter", type=int, hidden=True, help="The descriptor by which the holder process was started.")
+@click.option(
+    "--follow",
+    metavar="PID",
+    type=click.IntRange(1),
+    help="Give the devices back when this process ends, as the shell of a job: $$. Default in a GitLab job: its shell.",
+)
+@priority_option
+@tolerate_option
+@for_option
+@partial(hold_options, runs_command=False)
+@common.runs
+async def acquire(
+    needs: Any, span_: Decimal, follow: int | None, starter: int | None, name: str | None, **rest: Any
+) -> int:
+    """Wait for devices and hold them for the commands that follow: prints a token and returns.
+
+    A process in the background of this host holds the devices until `zscout release TOKEN`, or until the time of
+    --for is over. `zscout run TOKEN -- COMMAND` runs commands under the hold, in later steps of a job or in another
+    terminal of the same user; `zscout renew TOKEN --for 1h` extends it. The hold is protected from requests of equal
+    priority for the time of --for.
+
+    The devices are given back as well when the holder process ends, by whatever signal, and with --follow when that
+    process does. Nothing but the token goes to stdout; a DEVICE, and the exit codes, are those of `zscout request`.
+
+    \b
+    Examples:
+      TOKEN=$(zscout acquire dut/board --for 2h)
+      zscout acquire 'gpu/*' --for 30m --timeout 10m --follow $$
+      zscout acquire dut/board --for 2h --json | jq -r .token
+    """
+    follow = follow if follow is not None else _job_process()
+    if starter is None:
+        return await _start(follow, rest["json_file"], as_json=rest["as_json"])
+    channel = Channel(socket.socket(fileno=starter))
+    os.set_inheritable(starter, False)
+    from zscout.cli.requests import token_holder
+
+    terms: dict[str, Any] = {"min_runtime": span_, "grace": None, "again": False, "direct": True, "release_after": None}
+    wanted: HoldOptions = gather(needs, name, DEFAULT_NAMES[2], keep=True, **terms, **rest)
+    async with common.connected("acquire") as client:
+        return await token_holder.hold(client, wanted, float(span_), follow, channel)
+
+
+def _job_process() -> int | None:
+    """The shell of a GitLab job, which leads the group of all that the job starts. Other CI services end what a job
+    left by its environment, and run each step in a shell of its own."""
+    group = os.getpgrp()
+    return group if os.environ.get("GITLAB_CI") and group not in (0, os.getpid()) else None
+
+
+async def _start(follow: int | None, json_file: str | None, *, as_json: bool) -> int:
+    """Start the holder process, and print the token that it sends. Returns its exit code where it sends none."""
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    context = click.get_current_context()
+    fleet = common.fleet_file()
+    command = [sys.executable, "-P", "-m", "zscout.cli.main", *(["--fleet", str(fleet)] if fleet is not None else [])]
+    command += ["acquire", *context.meta["args"], "--starter", str(theirs.fileno())]
+    command += ["--follow", str(follow)] if follow is not None else []
+    given = [int(json_file)] if json_file is not None and is_descriptor(json_file) else []
+    process = subprocess.Popen(  # noqa: S603, ASYNC220 - returns at once
+        command,
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.DEVNULL,
+        start_new_session=True,
+        pass_fds=(theirs.fileno(), *(fd for fd in given if fd > 2)),
+    )
+    theirs.close()
+    channel = Channel(ours)
+    try:
+        received = await channel.receive(Granted)
+        if received is not None:
+            granted, _ = received
+            if as_json:
+                print_json({"token": granted.token} | granted.details)
+            else:
+                print_line(granted.token)
+            channel.send(ToHolder("printed"))
+            return 0
+    except BaseException:
+        channel.close()  # it gives up
+        with suppress(subprocess.TimeoutExpired):
+            process.wait(HOLDER_ENDS)
+        raise
+    code = await asyncio.to_thread(process.wait)
+    if code < 0:
+        raise Failed(f"the holder process was ended by signal {-code}; nothing is held")
+    return code
+
+
+# With a token
+
+
+class Token:
+    """The token that a command is given. Raises BadInput, or Failed where its hold has ended."""
+
+    def __init__(self, token: str) -> None:
+        path = token_files.find(token)
+        if path is None:
+            hint = f"; {token} is a device: zscout request {token} -- COMMAND" if "/" in token else ""
+            raise BadInput(f"unknown token {quoted(token)}{hint or _known()}")
+        self.path: Path = path
+        try:
+            self.file: TokenFile = token_files.read(path)
+        except (OSError, msgspec.DecodeError) as error:
+            raise Failed(f"{path} can't be read: {error}") from None
+        if self.file.ended:
+            raise Failed(f"{self.file.arc} has ended: {self.file.ended}; acquire the devices again", self.file.code)
+        channel = token_files.connect(path)
+        if channel is None:
+            raise Failed(f"{self.file.arc} has ended: {DIED}; acquire the devices again", TAKEN_AWAY)
+        self.channel: Channel = channel
+
+    async def receive(self) -> FromHolder | None:
+        """The next word of the holder process; None: it has ended."""
+        received = await self.channel.receive(FromHolder)
+        return received[0] if received is not None else None
+
+    async def answer(self) -> FromHolder:
+        """The same, soon. Raises Failed."""
+        try:
+            async with asyncio.timeout(ANSWERS):
+                word = await self.receive()
+        except TimeoutError:
+            raise Failed(f"the holder process {self.file.pid} of {self.file.arc} does not answer; try again") from None
+        if word is None:
+            raise Failed(f"{self.file.arc} has ended: {DIED}; acquire the devices again", TAKEN_AWAY)
+        if word.op == "refused":
+            raise Failed(f"{self.file.arc}: {word.why}")
+        if word.op == "end":
+            raise Failed(f"{self.file.arc} has ended: {word.why}; acquire the devices again", word.code)
+        return word
+
+
+DIED: Final = "its holder process has gone, and the devices are given back"
+
+
+def _known() -> str:
+    known = token_files.tokens()
+    listed = f"; known here: {', '.join(known[:8])}" if known else ", and there is none of yours on this host"
+    return f"{listed}; a token is good for the same user on the same host"
+
+
+@click.command(cls=CommandAfterDashes)
+@token_argument
+@infra_exit_option
+@grace_option
+@common.runs
+async def run(token: str, grace: Decimal | None, infra_exit: int | None) -> int:
+    """Run a command under the hold of a token that `zscout acquire` printed.
+
+    The command finds the same variables in its environment as with `zscout request -- COMMAND`, and ends as it does
+    there: when its hold ends, it and its processes get SIGTERM, and SIGKILL after the grace; the same happens if zscout
+    or the process that holds dies or hangs. When it ends by itself, the devices stay held. Several commands may run
+    under one token at a time.
+
+    \b
+    Exit code: the command's own (128 + n: ended by signal n), or
+      75   the devices were taken away, or given back by another command
+      124  the time of --for was over
+      126  it can't be executed           127  there is no such command
+      1    the process that holds does not answer     2    there is no such token
+    With --infra-exit N it is N instead of 1, 2, 75 and 124: all else is the command's own.
+
+    \b
+    Examples:
+      zscout run $TOKEN -- ./flash.sh
+      zscout run $TOKEN --infra-exit 99 -- pytest tests/on_board
+    """
+    command: tuple[str, ...] = click.get_current_context().meta["command"]
+    if not command:
+        raise click.UsageError("-- COMMAND is missing", click.get_current_context())
+    check_command(command)
+    held = Token(token)
+    read, write = os.pipe()
+    held.channel.send(ToHolder("run"), [read])
+    os.close(read)
+    try:
+        begun = await held.answer()
+        longest, text = grace_within(grace, begun.grace)
+        if text:
+            print_line(text, sys.stderr)
+        return await _run(held, command, begun, longest, write, infra_exit)
+    finally:
+        held.channel.close()
+
+
+async def _run(
+    held: Token, command: tuple[str, ...], begun: FromHolder, grace: float, kept: int, infra_exit: int | None
+) -> int:
+    """Under the hold. `kept` is closed."""
+    ended: FromHolder | None = None
+    running = RunningCommand(command, os.environ | begun.env, grace, begun.at, kept)
+
+    async def follow() -> None:
+        nonlocal ended
+        while (word := await held.receive()) is None or word.op != "end":
+            if word is None:
+                word = FromHolder("end", at=now(), why=DIED, code=TAKEN_AWAY)
+                break
+            running.hold_until(word.at)
+        ended = word
+        running.terminate(word.at)
+
+    try:
+        async with running:
+            os.close(kept)
+            _, over = await common.first_of(follow(), running.wait())
+            if over and running.why_ended not in ("client", "deadline"):
+                return await running.wait()
+            why = ended.why if ended is not None else "its hold could not be confirmed in time"
+            print_line(clean(f"zscout: {command[0]} is stopped: {held.file.arc} has ended: {why}"), sys.stderr)
+    finally:
+        if running.gone:
+            held.channel.send(ToHolder("gone"))
+    return infra_exit or (ended.code if ended is not None else TAKEN_AWAY)
+
+
+@click.command(cls=HoldCommand)
+@token_argument
+@for_option
+@infra_exit_option
+@json_option("Print one JSON object.")
+@common.runs
+async def renew(token: str, span_: Decimal, as_json: bool, infra_exit: int | None) -> None:
+    """Hold the devices of a token for at most this long from now.
+
+    The hold is protected for the time that it was acquired for. After that you keep the devices until a request of
+    equal or higher priority waits for one of them: acquire them for longer if that must not be.
+
+    \b
+    Examples:
+      zscout renew $TOKEN --for 1h
+    """
+    held = Token(token)
+    held.channel.send(ToHolder("renew", float(span_)))
+    try:
+        done = await held.answer()
+    finally:
+        held.channel.close()
+    seconds, protected = float(span_), min(done.remaining, float(span_))
+    if as_json:
+        found = {"token": token, "arc": held.file.arc, "for": seconds, "protected": round(protected, 3)}
+        print_json(found)
+        return
+    then = "" if protected >= seconds else f", protected for {span(protected)}, then unless another request waits"
+    print_line(clean(f"{held.file.arc} is yours for {span(seconds)} (until {clock(seconds)}){then}"))
+
+
+async def release_token(token: str) -> TokenFile | None:
+    """End the hold of a token, if this is one; None: it is none. A hold that has ended is forgotten. Raises Failed."""
+    path = token_files.find(token)
+    if path is None:
+        return None
+    try:
+        file = token_files.read(path)
+    except (OSError, msgspec.DecodeError) as error:
+        raise Failed(f"{path} can't be read: {error}") from None
+    channel = None if file.ended else token_files.connect(path)
+    if channel is None:
+        token_files.remove(path)
+        return file if file.ended else msgspec.structs.replace(file, ended=DIED)
+    channel.send(ToHolder("release"))
+    try:
+        async with asyncio.timeout(GIVES_BACK):
+            received = await channel.receive(FromHolder)
+    except TimeoutError:
+        raise Failed(
+            f"the holder process {file.pid} of {file.arc} does not answer; to end it: kill {file.pid}"
+        ) from None
+    finally:
+        channel.close()
+    if received is None:
+        token_files.remove(path)
+    elif received[0].op == "refused":
+        raise Failed(f"{file.arc}: {received[0].why}; the devices wait until they have settled")
+    return file
