@@ -24,7 +24,8 @@ FILES: Final = {
     "not.rrd": "no recording",
 }
 NEEDS_ARGUMENTS: Final = {
-    "DEVICE...": ("request", "take", "book --at 9:00 --for 1h"),
+    "DEVICE...": ("request", "take", "acquire --for 1h", "book --at 9:00 --for 1h"),
+    "TOKEN": ("run", "renew --for 1h"),
     "REQUEST": ("release", "cancel", "why"),
     "ROBOT": ("drive",),
     "HOST": ("drain", "uncordon"),
@@ -34,7 +35,7 @@ NEEDS_ARGUMENTS: Final = {
     "NAME|ID": ("booking show", "booking cancel", "unbook"),
     "FILE": ("replay",),
     "--at": ("book robot/a", "maintain robot/a --for 1h"),
-    "--for": ("slots robot/a",),
+    "--for": ("slots robot/a", "acquire robot/a"),
     "--source": ("motion", "watch"),
 }
 """What is missing, and where."""
@@ -73,6 +74,15 @@ request --booking x --dry-run | --dry-run can't be used with --booking; leave it
 take framegrabber/*#0 | pattern "framegrabber/*#0" is not valid; write kind/name with * for a whole name or $* for a
 take robot/a:= | parameter "" is not valid; use 1 to 64 of A-Z a-z 0-9 _ . -; write parameter=number, as in
 take robot/a --min-runtime 0 | --min-runtime must be positive, and is 0
+request robot/a --infra-exit 256 | --infra-exit: 256 is out of range; write 1 to 255
+request robot/a --json-file /none/events | --json-file "/none/events" can't be written (No such file or directory)
+acquire robot/a --for 1h -- true | acquire runs no command; write zscout run TOKEN -- COMMAND after it
+acquire robot --for 1h | device "robot" is not valid; write kind/name, as in robot/scout33
+acquire robot/a --for 0 | --for must be positive, and is 0; write more than 0, at most 3660 d
+run survey-000000000000 | -- COMMAND is missing (see zscout run --help)
+run survey-000000000000 -- true | unknown token "survey-000000000000"
+run robot/a -- true | unknown token "robot/a"; robot/a is a device: zscout request robot/a -- COMMAND
+renew survey --for 1h | unknown token "survey"
 drive radio/rf0 | "radio/rf0" is not a robot; name one, as in robot/NAME
 drive robot/a | standard input is not a terminal, and zscout drive reads keys; run it at a terminal
 drive robot/a --speed 9 | --speed: 9.0 is out of range; write 0.1 to 1.0

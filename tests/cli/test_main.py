@@ -222,7 +222,7 @@ def test_completion_knows_the_commands_without_loading_them() -> None:
     assert script.returncode == 0
     assert "_ZSCOUT_COMPLETE=bash_complete" in script.stdout
     asked = zscout(_ZSCOUT_COMPLETE="bash_complete", COMP_WORDS="zscout re", COMP_CWORD="1")
-    assert asked.stdout.split() == ["plain,request", "plain,release", "plain,replay"]
+    assert asked.stdout.split() == ["plain,request", "plain,renew", "plain,release", "plain,replay"]
     below = zscout(_ZSCOUT_COMPLETE="bash_complete", COMP_WORDS="zscout component s", COMP_CWORD="2")
     assert below.stdout.split() == ["plain,start", "plain,stop"]
     options = zscout(_ZSCOUT_COMPLETE="bash_complete", COMP_WORDS="zscout request --min", COMP_CWORD="2")

@@ -37,7 +37,7 @@ from zscout.cli.requests.options import (
 )
 from zscout.cli.requests.request import TAKEN_AWAY
 from zscout.cli.requests.run_command import RunningCommand, check_command
-from zscout.cli.requests.token_files import Channel, FromHolder, Granted, ToHolder, TokenFile
+from zscout.cli.requests.token_files import FromHolder, ToHolder, TokenChannel, TokenFile, TokenGranted
 from zscout.config.strict import BadInput, quoted
 from zscout.terminal import clean, clock, print_json, print_line, span
 
@@ -103,13 +103,13 @@ async def acquire(
     \b
     Examples:
       TOKEN=$(zscout acquire dut/board --for 2h)
-      zscout acquire 'gpu/*' --for 30m --timeout 10m --follow $$
+      zscout acquire 'gpu/*' --for 30m --timeout 10m --follow 4711
       zscout acquire dut/board --for 2h --json | jq -r .token
     """
     follow = follow if follow is not None else _job_process()
     if starter is None:
         return await _start(follow, rest["json_file"], as_json=rest["as_json"])
-    channel = Channel(socket.socket(fileno=starter))
+    channel = TokenChannel(socket.socket(fileno=starter))
     os.set_inheritable(starter, False)
     from zscout.cli.requests import token_holder
 
@@ -143,9 +143,9 @@ async def _start(follow: int | None, json_file: str | None, *, as_json: bool) ->
         pass_fds=(theirs.fileno(), *(fd for fd in given if fd > 2)),
     )
     theirs.close()
-    channel = Channel(ours)
+    channel = TokenChannel(ours)
     try:
-        received = await channel.receive(Granted)
+        received = await channel.receive(TokenGranted)
         if received is not None:
             granted, _ = received
             if as_json:
@@ -168,7 +168,7 @@ async def _start(follow: int | None, json_file: str | None, *, as_json: bool) ->
 # With a token
 
 
-class Token:
+class UsedToken:
     """The token that a command is given. Raises BadInput, or Failed where its hold has ended."""
 
     def __init__(self, token: str) -> None:
@@ -186,7 +186,7 @@ class Token:
         channel = token_files.connect(path)
         if channel is None:
             raise Failed(f"{self.file.arc} has ended: {DIED}; acquire the devices again", TAKEN_AWAY)
-        self.channel: Channel = channel
+        self.channel: TokenChannel = channel
 
     async def receive(self) -> FromHolder | None:
         """The next word of the holder process; None: it has ended."""
@@ -248,7 +248,7 @@ async def run(token: str, grace: Decimal | None, infra_exit: int | None) -> int:
     if not command:
         raise click.UsageError("-- COMMAND is missing", click.get_current_context())
     check_command(command)
-    held = Token(token)
+    held = UsedToken(token)
     read, write = os.pipe()
     held.channel.send(ToHolder("run"), [read])
     os.close(read)
@@ -263,7 +263,7 @@ async def run(token: str, grace: Decimal | None, infra_exit: int | None) -> int:
 
 
 async def _run(
-    held: Token, command: tuple[str, ...], begun: FromHolder, grace: float, kept: int, infra_exit: int | None
+    held: UsedToken, command: tuple[str, ...], begun: FromHolder, grace: float, kept: int, infra_exit: int | None
 ) -> int:
     """Under the hold. `kept` is closed."""
     ended: FromHolder | None = None
@@ -309,7 +309,7 @@ async def renew(token: str, span_: Decimal, as_json: bool, infra_exit: int | Non
     Examples:
       zscout renew $TOKEN --for 1h
     """
-    held = Token(token)
+    held = UsedToken(token)
     held.channel.send(ToHolder("renew", float(span_)))
     try:
         done = await held.answer()

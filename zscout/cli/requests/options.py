@@ -189,7 +189,6 @@ class HoldCommand(click.Command):
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         ctx.meta["infra_exit"] = _infra_exit_in(args)
-        ctx.meta.setdefault("command", ())
         with _own_failures(ctx):
             return super().parse_args(ctx, args)
 
@@ -362,7 +361,7 @@ tolerate_option: Final = click.option(
 
 
 def grace_within(asked: Decimal | None, most: float) -> tuple[float, str]:
-    """The grace, and what people are told where it is less than what was asked for."""
+    """The grace, and a line for people if it is less than `asked`."""
     if asked is None or asked <= most:
         return most if asked is None else float(asked), ""
     text = f"--grace {span(float(asked))} is more than the devices allow: SIGKILL follows {span(most)} after SIGTERM"
@@ -389,7 +388,7 @@ def gather(
         if rest["min_runtime"] is not None:
             raise BadInput("--release-after and --min-runtime exclude each other; use only one of them")
         keep, rest["min_runtime"] = False, release_after
-    command: tuple[str, ...] = context.meta["command"]
+    command: tuple[str, ...] = context.meta.get("command") or ()
     if command:
         check_command(command)
         default_name = valid_name(Path(command[0]).name)

@@ -72,7 +72,7 @@ class FromHolder(msgspec.Struct, frozen=True, omit_defaults=True):
     """`done`, of `renew`: seconds for which the hold is protected."""
 
 
-class Granted(msgspec.Struct, frozen=True):
+class TokenGranted(msgspec.Struct, frozen=True):
     """From the process that holds to the one that started it."""
 
     token: str
@@ -80,7 +80,7 @@ class Granted(msgspec.Struct, frozen=True):
     details: dict[str, Any]
 
 
-class Channel:
+class TokenChannel:
     """One connection, or socketpair, of words."""
 
     def __init__(self, connection: socket.socket) -> None:
@@ -225,7 +225,7 @@ def listen(path: Path) -> socket.socket:
     return server
 
 
-def accept(server: socket.socket) -> Channel | None:
+def accept(server: socket.socket) -> TokenChannel | None:
     """A process of the same user, or None."""
     try:
         connection, _ = server.accept()
@@ -236,10 +236,10 @@ def accept(server: socket.socket) -> Channel | None:
     if uid not in (0, os.getuid()):
         connection.close()
         return None
-    return Channel(connection)
+    return TokenChannel(connection)
 
 
-def connect(path: Path) -> Channel | None:
+def connect(path: Path) -> TokenChannel | None:
     """A connection to the process that holds for the token; None: it has ended."""
     connection = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     try:
@@ -248,7 +248,7 @@ def connect(path: Path) -> Channel | None:
     except OSError:
         connection.close()
         return None
-    return Channel(connection)
+    return TokenChannel(connection)
 
 
 def _lives(path: Path) -> bool:

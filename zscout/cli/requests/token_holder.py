@@ -26,7 +26,7 @@ from zscout.cli.requests import token_files
 from zscout.cli.requests.options import HoldOptions
 from zscout.cli.requests.request import TAKEN_AWAY, TIME_OVER, Report, ending_of, held_text, tolerate, wait_for_grant
 from zscout.cli.requests.run_command import hold_variables
-from zscout.cli.requests.token_files import Channel, FromHolder, Granted, ToHolder, TokenFile
+from zscout.cli.requests.token_files import FromHolder, ToHolder, TokenChannel, TokenFile, TokenGranted
 from zscout.config.strict import BadInput
 from zscout.keyexpr import new_instance
 from zscout.terminal import clock, span
@@ -40,21 +40,21 @@ KILLED_WITHIN: Final = 2.0
 """Seconds after the grace in which guardians have killed what they guard."""
 
 
-class Ending(NamedTuple):
+class TokenEnding(NamedTuple):
     """How the hold ended: in words, and the exit code of commands that ran, or are run later."""
 
     why: str
     code: int = TAKEN_AWAY
 
 
-RELEASED: Final = Ending("released")
-INTERRUPTED: Final = Ending("its holder process was ended")
+RELEASED: Final = TokenEnding("released")
+INTERRUPTED: Final = TokenEnding("its holder process was ended")
 
 
 class _Run:
     """One `zscout run`, and its command."""
 
-    def __init__(self, channel: Channel) -> None:
+    def __init__(self, channel: TokenChannel) -> None:
         self.channel = channel
         self.tree_gone, self.client_gone = asyncio.Event(), asyncio.Event()
 
@@ -67,20 +67,20 @@ class TokenHolder:
         self._direct: DirectHold | None = client.internals.direct_hold(held.grant)
         self._limit: Ns = held.now() + round(seconds * SECOND)
         self._runs: set[_Run] = set()
-        self._releasing: list[Channel] = []
-        self._ending: asyncio.Future[Ending] = asyncio.get_running_loop().create_future()
+        self._releasing: list[TokenChannel] = []
+        self._ending: asyncio.Future[TokenEnding] = asyncio.get_running_loop().create_future()
         self._changed = asyncio.Event()
         self._talks: set[asyncio.Task[None]] = set()
         if self._direct is not None:
             self._direct.watch(self._follow)
 
-    async def until_over(self, path: Path, followed: int | None) -> Ending:
+    async def until_over(self, path: Path, followed: int | None) -> TokenEnding:
         """Serve the token of this file until the hold is over; `followed` is a process's descriptor."""
         server = token_files.listen(path)
         loop = asyncio.get_running_loop()
         loop.add_reader(server, self._accept, server)
         if followed is not None:
-            loop.add_reader(followed, self._end, Ending("the process that it follows has ended"))
+            loop.add_reader(followed, self._end, TokenEnding("the process that it follows has ended"))
         try:
             async with common.beside(self._watch_hold()):
                 while not self._ending.done():
@@ -93,7 +93,7 @@ class TokenHolder:
             if followed is not None:
                 loop.remove_reader(followed)
 
-    async def give_back(self, ending: Ending) -> bool:
+    async def give_back(self, ending: TokenEnding) -> bool:
         """End the commands, then give the devices back; False where a command can't be ended: they are left to
         settle."""
         if not self._ending.done():
@@ -122,7 +122,7 @@ class TokenHolder:
 
     # How it ends
 
-    def _end(self, ending: Ending) -> None:
+    def _end(self, ending: TokenEnding) -> None:
         if not self._ending.done():
             self._ending.set_result(ending)
 
@@ -130,17 +130,17 @@ class TokenHolder:
         await self._held.over()
         ending = ending_of(self._arc)
         if ending.outcome == "completed":
-            self._end(Ending(ending.reason or "its time is over", TIME_OVER))
+            self._end(TokenEnding(ending.reason or "its time is over", TIME_OVER))
         else:
-            self._end(Ending(ending.reason or ending.outcome))
+            self._end(TokenEnding(ending.reason or ending.outcome))
 
     def _look(self, path: Path) -> float:
         """Whether its time is over or its file was removed. Returns the seconds that are left."""
         left = (self._limit - self._held.now()) / SECOND
         if left <= 0:
-            self._end(Ending("its time is over", TIME_OVER))
+            self._end(TokenEnding("its time is over", TIME_OVER))
         if not path.exists():
-            self._end(Ending("the file of its token was removed"))
+            self._end(TokenEnding("the file of its token was removed"))
         return left
 
     # Who uses it
@@ -151,7 +151,7 @@ class TokenHolder:
             self._talks.add(talk)
             talk.add_done_callback(self._talks.discard)
 
-    async def _talk(self, channel: Channel) -> None:
+    async def _talk(self, channel: TokenChannel) -> None:
         received = await channel.receive(ToHolder)
         match received:
             case ToHolder(op="run"), [tree]:
@@ -169,7 +169,7 @@ class TokenHolder:
                     os.close(fd)
                 channel.close()
 
-    async def _serve_run(self, channel: Channel, tree: int) -> None:
+    async def _serve_run(self, channel: TokenChannel, tree: int) -> None:
         run = _Run(channel)
         try:
             if self._ending.done():
@@ -223,7 +223,7 @@ class TokenHolder:
                     await self._changed.wait()
 
 
-async def hold(client: Client, wanted: HoldOptions, seconds: float, follow: int | None, starter: Channel) -> int:
+async def hold(client: Client, wanted: HoldOptions, seconds: float, follow: int | None, starter: TokenChannel) -> int:
     """Wait for the devices, hand the token to the process that started this one, and hold. Raises Failed,
     RequestRefused, BadInput."""
     followed = _descriptor_of(follow)
@@ -245,9 +245,9 @@ async def hold(client: Client, wanted: HoldOptions, seconds: float, follow: int 
         try:
             token = f"{arc.name}-{new_instance()}"
             path, content = _new_file(token, client, held)
-            starter.send(Granted(token, text, {"arc": arc.name, "client": str(client.mesh.me)} | details))
+            starter.send(TokenGranted(token, text, {"arc": arc.name, "client": str(client.mesh.me)} | details))
             if await starter.receive(ToHolder) is None:
-                ending = Ending("the token was not printed")
+                ending = TokenEnding("the token was not printed")
             else:
                 starter.close()
                 _detach(wanted)
@@ -268,7 +268,7 @@ async def hold(client: Client, wanted: HoldOptions, seconds: float, follow: int 
     return 0
 
 
-async def _granted(client: Client, wanted: HoldOptions, report: Report, starter: Channel) -> Held:
+async def _granted(client: Client, wanted: HoldOptions, report: Report, starter: TokenChannel) -> Held:
     """The hold, as soon as there is one; nothing is waited for once the starter has gone."""
     waiting = asyncio.ensure_future(wait_for_grant(client, wanted, report, None))
 
@@ -316,7 +316,7 @@ def _new_file(token: str, client: Client, held: Held) -> tuple[Path, TokenFile]:
     return path, content
 
 
-def _leave_word(path: Path, content: TokenFile, ending: Ending, *, forget: bool) -> None:
+def _leave_word(path: Path, content: TokenFile, ending: TokenEnding, *, forget: bool) -> None:
     """Write how the hold ended, for a later use of the token; nothing if it was released, or its file removed."""
     with suppress(OSError):
         there = path.exists()
