@@ -1,6 +1,6 @@
 """The process behind a token: it waits for the devices, holds them, and has commands run under the hold.
 
-It is started by `zscout acquire` and outlives it, in a session of its own. Each `zscout run` is told how long the hold
+It is started by `zscout acquire` and outlives it, in a session of its own. Each `zscout run` learns how long the hold
 may be relied on; its guardian ends its command by then, whatever happens to this process. The devices are given back
 only when no command is left: a command that can't be ended, and the death of this process, leave it to the devices
 to settle."""
