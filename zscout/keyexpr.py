@@ -41,6 +41,15 @@ def check_name(name: str, what: str = "name") -> str:
     return name
 
 
+def check_new_name(name: str, what: str) -> str:
+    """The same of a name that somebody gives; the error proposes a valid one, as `test_gpu-0` for `test_gpu[0]`."""
+    try:
+        return check_name(name, what)
+    except BadName as error:
+        near = re.sub(r"-{2,}", "-", valid_name(name[:200])).strip("-")
+        raise BadName(f"{error}, as in {near}" if re.search("[A-Za-z0-9]", near) and name else str(error)) from None
+
+
 @lru_cache(REMEMBERED)
 def check_rc(name: str) -> str:
     """`kind/name` itself if it names an RC; raises BadName otherwise."""

@@ -56,7 +56,10 @@ usage --user ada | there is no option --user (see zscout usage --help)
 maintain robot/a --reason stuck | there is no option --reason; did you mean --comment?
 history --device robot/a | there is no option --device; did you mean --rc?
 request robot/a --timeout -1 | --timeout: "-1" is not a duration
-request robot/a --name a/b | --name "a/b" is not valid; use 1 to 64 of A-Z a-z 0-9 _ . -
+request robot/a --name a/b | --name "a/b" is not valid; use 1 to 64 of A-Z a-z 0-9 _ . -, as in a-b
+request robot/a --name test_gpu[0] | use 1 to 64 of A-Z a-z 0-9 _ . -, as in test_gpu-0
+request robot/a --name 'ci job 7/9' | use 1 to 64 of A-Z a-z 0-9 _ . -, as in ci-job-7-9
+request robot/a --name '///' | --name "///" is not valid; use 1 to 64 of A-Z a-z 0-9 _ . -
 request robot | device "robot" is not valid; write kind/name, as in robot/scout33; a command goes after --
 request robot/a robot/a | robot/a is named twice; name each device once, with all its parameters after one colon
 request robot/a:rate | rate has no number; write parameter=number, as in robot/a:command_rate=5

@@ -41,6 +41,7 @@ def when(text: str, zone: ZoneInfo = BERLIN, now: float = NOW) -> str:
     [
         ("tue 14:00", "2026-12-01T14:00:00+01:00"), ("Tuesday  14:00", "2026-12-01T14:00:00+01:00"),
         ("thu 14:00", "2026-11-26T14:00:00+01:00"), ("thu 12:00", "2026-12-03T12:00:00+01:00"),
+        ("next tuesday 14:00", "2026-12-01T14:00:00+01:00"), ("next thu 14:00", "2026-12-03T14:00:00+01:00"),
         ("thu 9:00", "2026-12-03T09:00:00+01:00"), ("tomorrow 9:00", "2026-11-27T09:00:00+01:00"),
         ("today 23:59:58", "2026-11-26T23:59:58+01:00"), ("14:30", "2026-11-26T14:30:00+01:00"),
         ("9:05", "2026-11-27T09:05:00+01:00"), ("2pm", "2026-11-26T14:00:00+01:00"),
@@ -69,6 +70,7 @@ def test_what_is_soon_is_never_before_it_was_asked() -> None:
 @pytest.mark.parametrize(
     "text",
     [
+        *("next", "next week", "next tomorrow 9:00", "next 14:00", "next 2026-12-01 9:00"),
         *("", "soon", "tue", "14", "25:00", "14:60", "13pm", "0am", "2026-02-29 10:00", "2026-13-01 10:00", "t 14:00"),
         *("in", "in -2h", "in two hours", "2026-12-01", "tue 14:00 sharp", "s 14:00", "2026-12-01T14:00+99:00"),
         *("٣:30", "0001-01-01 00:00", "in 400d"),
@@ -87,6 +89,9 @@ def test_any_text_is_a_date_or_bad_input(text: str) -> None:
 
 
 def test_a_whole_day_is_only_one_where_days_are_asked_for() -> None:
+    assert parse_date("next thu", "--date").whole_day(NOW, BERLIN) == date(2026, 12, 3)
+    with pytest.raises(BadInput, match='has no time; write "next tuesday 14:00"'):
+        parse_date("next tuesday", "--at").found(NOW, BERLIN)
     written = parse_date("tue", "--date")
     assert written.whole_day(NOW, BERLIN) == date(2026, 12, 1)
     assert parse_date("tue 14:00", "--date").whole_day(NOW, BERLIN) is None

@@ -17,10 +17,12 @@ from click.testing import CliRunner
 from tests.cli import tools
 from tests.hang import HANG
 from tests.live.lab import Lab
+from zscout.behaviors.client.client import RequestRefused
 from zscout.cli.groups import LazyGroup, booking, component, instead
-from zscout.cli.main import HABITS, HEADINGS, INSTEAD, OLD, main
+from zscout.cli.main import HABITS, HEADINGS, INSTEAD, OLD, explain, main
 from zscout.cli.requests.options import gather_needs, parse_duration, parse_need
 from zscout.config.strict import BadInput
+from zscout.messages import Problem
 from zscout.terminal import Table, span
 
 HEAVY = ("zenoh", "rich", "rerun", "msgspec", "numpy", "cv2")
@@ -170,6 +172,7 @@ def test_a_mesh_without_an_rcm_is_3(tmp_path: Path) -> None:
     assert done.returncode == 3
     who = "(no other program either); start zscout-node"
     assert done.stderr.startswith(f"zscout: no leader is on the mesh of fleet {lab.fleet.name} {who}")
+    assert "check the fleet file (--fleet, $ZSCOUT_FLEET)" in done.stderr
     assert done.stderr.count("\n") == 1
 
 
@@ -328,3 +331,10 @@ def test_plain_tables_align() -> None:
         "robot/a  x",
         "b/c",
     ]
+
+
+def test_a_hint_at_an_option_is_one_at_an_argument_in_a_program() -> None:
+    hint = "unknown device robot/a; to wait for it anyway, "
+    refused = RequestRefused(Problem("unknown_device", f"{hint}add --wait-for-device"))
+    assert str(refused) == f"{hint}pass wait_for_device=True"
+    assert explain(refused) == (2, f"zscout: {hint}add --wait-for-device")

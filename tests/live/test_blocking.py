@@ -290,6 +290,7 @@ def test_without_an_rcm_it_says_so_and_what_to_do(tmp_path: Path) -> None:
     assert told.startswith(
         f"no leader is on the mesh of fleet {lab.fleet.name} (no other program either); start zscout-node"
     )
+    assert "check the fleet file ($ZSCOUT_FLEET)" in told
 
 
 def test_a_lab_that_was_closed_says_so(fleet: CliFleet) -> None:

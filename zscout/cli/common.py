@@ -147,7 +147,7 @@ async def see_rcm(client: Client, seconds: float = LOOK_FOR_RCM) -> None:
     try:
         await client.see_rcm(seconds, LOOK_FOR_TAKEOVER)
     except NoRcm as nobody:
-        raise NobodyThere(str(nobody)) from None
+        raise NobodyThere(str(nobody).replace(f"(${FLEET_VARIABLE})", f"(--fleet, ${FLEET_VARIABLE})")) from None
 
 
 async def state_of(client: Client, arc: str | None = None, *, forecast: bool = False) -> RcmState:

@@ -57,6 +57,8 @@ class WrittenDate:
     """Seconds from now."""
     day: date | int | str | None = None
     """A date, a weekday (0: Monday), `today`, `tomorrow`; None: the next such time."""
+    not_today: bool = False
+    """For a weekday: the first one after today."""
     time: time | None = None
     """None: a whole day is meant."""
     instant: datetime | None = None
@@ -89,7 +91,8 @@ class WrittenDate:
             case date():
                 return self.day
             case int():
-                return today + timedelta(days=(self.day - today.weekday()) % 7)
+                days = (self.day - today.weekday()) % 7
+                return today + timedelta(days=days or 7 * self.not_today)
         return today + timedelta(days=self.day == "tomorrow")
 
 
@@ -113,13 +116,16 @@ def parse_date(text: str, option: str) -> WrittenDate:
             if whole["offset"]:
                 return WrittenDate(text, option, instant=at)
             return WrittenDate(text, option, day=at.date(), time=at.time())
-        first, _, rest = words.partition(" ")
+        following = words.startswith("next ")
+        first, _, rest = words.removeprefix("next ").partition(" ")
         if (day := _DAY.fullmatch(first)) is None:
             return WrittenDate(text, option, time=_time(words, bad))
         meant = date.fromisoformat(day["date"]) if day["date"] else _named_day(day["name"], bad)
+        if following and not isinstance(meant, int):
+            raise bad
         if isinstance(meant, date) and meant.year not in YEARS:
             raise _out_of_reach(text, option, meant.year)
-        return WrittenDate(text, option, day=meant, time=_time(rest, bad) if rest else None)
+        return WrittenDate(text, option, day=meant, time=_time(rest, bad) if rest else None, not_today=following)
     except ValueError:  # the 30th of February, 25:00
         raise bad from None
 

@@ -26,7 +26,7 @@ from zscout.behaviors.client.request import (
     check_seconds,
 )
 from zscout.config.fleet import FLEET_VARIABLE, Fleet, beside, fleet_from_env
-from zscout.keyexpr import USERS, Role, Sender, Token, check_name, new_instance
+from zscout.keyexpr import USERS, Role, Sender, Token, check_name, check_new_name, new_instance
 from zscout.mesh import Mesh, ZenohMesh
 from zscout.mesh.exchange import naming_versions
 from zscout.mesh.supervision import done_within
@@ -127,7 +127,7 @@ class Client:
         links = self.mesh.links()
         who = f"{links} link{'s' * (links > 1)} to other programs" if links else "no other program either"
         raise NoRcm(
-            f"{nobody} ({who}); start zscout-node on a host, or check the fleet file (--fleet, ${FLEET_VARIABLE}): "
+            f"{nobody} ({who}); start zscout-node on a host, or check the fleet file (${FLEET_VARIABLE}): "
             "`zscout doctor` finds the cause"
         )
 
@@ -173,7 +173,7 @@ class Client:
         Raises RequestRefused if the request can never be granted as it is, ValueError if the comment is too long."""
         wanted = amounts(needs)
         who = replace(self.who or Who(), comment=checked_comment(comment)) if comment else self.who
-        arc = await self.internals.claim(check_name(name, "arc"), wanted)
+        arc = await self.internals.claim(check_new_name(name, "arc"), wanted)
         if arc is None:
             seconds, now = self._protected(min_runtime), self.mesh.now()
             arc = OpenArc(new_instance(), name, wanted, priority, seconds, keep, estimate, direct, since=now)

@@ -19,11 +19,15 @@ from zscout.types import NO_TERM, SECOND, Grant, Ns, Place, Term
 Needs = Mapping[str, Mapping[str, Any]]
 
 
+HINT = ("add --wait-for-device", "pass wait_for_device=True")
+"""What a leader proposes to people, and what a program writes."""
+
+
 class RequestRefused(Exception):
     """The request was refused. The message is the reason; `code` is one of the codes of the protocol."""
 
     def __init__(self, problem: Problem) -> None:
-        super().__init__(problem.message)
+        super().__init__(problem.message.replace(*HINT))
         self.code = problem.code
 
 

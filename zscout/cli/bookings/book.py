@@ -54,7 +54,7 @@ from zscout.cli.dates import (
 from zscout.cli.ownership import User, yes_option
 from zscout.cli.requests.options import MAX_PRIORITY, Needs, gather_needs, parse_comment, parse_duration, parse_need
 from zscout.config.strict import BadInput, quoted
-from zscout.keyexpr import check_name, check_need, host_in, is_pattern, of_host, valid_name
+from zscout.keyexpr import check_name, check_need, check_new_name, host_in, is_pattern, of_host, valid_name
 from zscout.messages import MAX_AHEAD, WINDOW, BookingRecord, BookingsTold, BookingView, Who
 from zscout.services.bookings.dates import dates
 from zscout.terminal import clean, many, span
@@ -319,7 +319,7 @@ async def _make(
         raise BadInput("--until ends a repeated booking; add --every, or leave --until out")
     if patience is not None and patience > runtime:
         raise BadInput(f"--patience is longer than the booking; write at most {span(float(runtime))}")
-    name = check_name(name, "--name") if name is not None else None
+    name = check_new_name(name, "--name") if name is not None else None
     async with common.connected("maintain" if maintenance else "book") as client:
         # Others are told its name, and not by which command it was made.
         client.who = replace(client.who or Who(), command="")

@@ -24,7 +24,7 @@ from zscout.cli.groups import InfraExit
 from zscout.cli.requests.run_command import COMMAND_CODES, check_command
 from zscout.config import strict
 from zscout.config.strict import DURATIONS, BadInput, quoted
-from zscout.keyexpr import BadName, check_name, check_need, is_pattern, valid_name
+from zscout.keyexpr import BadName, check_name, check_need, check_new_name, is_pattern, valid_name
 from zscout.messages import MAX_NEEDS, MAX_PARAMS, MAX_SECONDS, Who
 from zscout.scheduling.needs import check_patterns
 from zscout.terminal import json_text, span
@@ -395,7 +395,11 @@ def gather(
     if rest["again"] and not command:
         raise BadInput("--again repeats a command; add one after --")
     return HoldOptions(
-        name=check_name(name or default_name, "--name"), needs=gather_needs(needs), command=command, keep=keep, **rest
+        name=check_new_name(name or default_name, "--name"),
+        needs=gather_needs(needs),
+        command=command,
+        keep=keep,
+        **rest,
     )
 
 
