@@ -25,28 +25,32 @@ if TYPE_CHECKING:
     from zscout.behaviors.client.blocking import BlockingHeld, Lab, connect
     from zscout.behaviors.client.bookings import BookingsClient
     from zscout.behaviors.client.client import Client, CommandRefused, NoRcm, RequestRefused
+    from zscout.behaviors.client.lab_status import LabStatus
     from zscout.behaviors.client.request import OpenArc
     from zscout.behaviors.components.component import Component, ComponentContext, Stage
     from zscout.config.fleet import Fleet, load_fleet
     from zscout.config.strict import BadInput
     from zscout.mesh import MeshError
+    from zscout.mesh.frames import Frame
 
 _NAMES = {
     "zscout.behaviors.client.arc": "Held Revoked hold holds",
     "zscout.behaviors.client.blocking": "BlockingHeld Lab connect",
     "zscout.behaviors.client.bookings": "BookingsClient",
     "zscout.behaviors.client.client": "Client CommandRefused NoRcm RequestRefused",
+    "zscout.behaviors.client.lab_status": "LabStatus",
     "zscout.behaviors.client.request": "OpenArc",
     "zscout.behaviors.components.component": "Component ComponentContext Stage",
     "zscout.config.fleet": "Fleet load_fleet",
     "zscout.config.strict": "BadInput",
     "zscout.mesh": "MeshError",
+    "zscout.mesh.frames": "Frame",
 }
 _HOME = {name: module for module, names in _NAMES.items() for name in names.split()}
 
 __all__ = [
     "BadInput", "BlockingHeld", "BookingsClient", "Client", "CommandRefused", "Component", "ComponentContext",
-    "Fleet", "Held", "Lab", "MeshError", "NoRcm", "OpenArc", "RequestRefused", "Revoked",
+    "Fleet", "Frame", "Held", "Lab", "LabStatus", "MeshError", "NoRcm", "OpenArc", "RequestRefused", "Revoked",
     "Stage", "__version__", "connect", "hold", "holds", "load_fleet",
 ]  # fmt: skip
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import signal
 import subprocess
 import sys
@@ -98,6 +99,54 @@ def test_a_direct_body_that_clears_up_for_too_long_is_interrupted_once_more(flee
     body = "try:\n    time.sleep(LONGER)\nfinally:\n    time.sleep(LONGER)"
     told = "revoked.outcome, isinstance(revoked.__context__, zscout.Revoked)"
     assert preempted(fleet, holding(body, how=", direct=True", told=told)) == ["preempted True"]
+
+
+def test_a_lab_and_its_holds_say_what_they_are(fleet: CliFleet) -> None:
+    text = """
+        with zscout.connect("notebook") as lab:
+            held = lab.acquire("survey", {"robot/a": {}}, min_runtime=60)
+            say(repr(lab), "|", repr(held), "|", "robot/a" in str(lab.status()))
+            say([row for row in str(lab.status()).splitlines() if row.startswith("robot/")])
+            held.release()
+            say(repr(held))
+        say(repr(lab))
+    """
+    first, devices, over, closed = rest_of(script(fleet.lab, text))
+    lab, held, known = first.split(" | ")
+    assert lab.startswith("<Lab ")
+    assert "/notebook in fleet " in lab
+    assert re.fullmatch(r"<BlockingHeld survey: robot/a; (59|60) s left>", held)
+    assert known == "True"
+    assert re.search(r"robot/a +\S+ +survey \(.+\), (59|60) s left", devices)
+    assert re.search(r"robot/b +\S+ +free", devices)
+    assert over == "<BlockingHeld survey: robot/a; over: given up by this client>"
+    assert closed == "<Lab closed>"
+
+
+def test_pictures_come_until_the_hold_is_over(fleet: CliFleet, fleet_kind: str) -> None:
+    if fleet_kind == "secured":
+        pytest.skip("a person's certificate publishes no pictures")
+    text = """
+        from zscout.drivers.driver import FrameHead
+
+        def film(mesh, grant, stop):
+            camera = mesh.frame_publisher(mesh.keys.frame("robot/a"))
+            while not stop.wait(0.02):
+                camera.put(FrameHead(7, 1.5, 160, 120, grant), b"jpeg")
+
+        with zscout.connect() as lab, zscout.connect() as other:
+            held, stop = lab.acquire("survey", {"robot/a": {}}, min_runtime=60), threading.Event()
+            threading.Thread(target=film, args=(other.client.mesh, held.grant, stop)).start()
+            seen = 0
+            for frame in held.frames("robot/a"):
+                seen += 1
+                if seen == 3:
+                    say(frame, frame.jpeg)
+                    held.release()
+            say("over")
+            stop.set()
+    """
+    assert rest_of(script(fleet.lab, text)) == ["<Frame 7: 160x120, 4 bytes, taken at 1.500 s> b'jpeg'", "over"]
 
 
 def test_a_sleep_is_interrupted_when_the_hold_is_preempted(fleet: CliFleet) -> None:

@@ -26,10 +26,22 @@ MAX_HEAD = 2_048  # bytes attached to a frame
 
 @dataclass(frozen=True, slots=True)
 class Frame:
+    """A picture as it came; a notebook shows it."""
+
     key: str
     head: FrameHead
+    """`number` counts pictures from when the source was first opened, `time` is in seconds by a clock of the
+    framegrabber's own, `grant` is the hold under which it was taken."""
     jpeg: bytes
-    arrived: Ns  # on this host's clock
+    arrived: Ns
+    """On this host's clock."""
+
+    def __repr__(self) -> str:
+        size, taken = f"{self.head.width}x{self.head.height}", f"{self.head.time:.3f} s"
+        return f"<Frame {self.head.number}: {size}, {len(self.jpeg):,} bytes, taken at {taken}>"
+
+    def _repr_jpeg_(self) -> bytes:
+        return self.jpeg
 
 
 class FramePublisher:

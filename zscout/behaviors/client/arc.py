@@ -13,7 +13,7 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections.abc import AsyncIterator, Mapping
-from contextlib import suppress
+from contextlib import closing, suppress
 from decimal import Decimal
 from typing import Any, Final
 
@@ -22,6 +22,7 @@ from zscout.behaviors.client.client import Client
 from zscout.behaviors.client.direct import DirectHold
 from zscout.behaviors.client.request import CommandRefused, HoldEnd, Needs, OpenArc, check_seconds
 from zscout.keyexpr import is_pattern
+from zscout.mesh.frames import Frame
 from zscout.messages import Done
 from zscout.types import SECOND, Grant, Ns
 
@@ -29,6 +30,8 @@ log = logging.getLogger(__name__)
 
 UNABLE: Final = ("unknown_command", "bad_command", "warming")
 """How a device of an older version refuses what it does not know."""
+LOOK_AGAIN: Final = 60.0
+"""Seconds after which pictures are waited for anew."""
 
 
 class Revoked(Exception):
@@ -126,6 +129,36 @@ class Held:
             return 0.0
         known = done.result.get("seconds") if isinstance(done.result, dict) else None
         return float(known) if isinstance(known, int | float) else 0.0
+
+    async def frames(self, need: str) -> AsyncIterator[Frame]:
+        """Yield the pictures of a held framegrabber as they come, until the hold is over: each time the newest, so that
+        who is slow misses some. Those of another hold are left out. Raises KeyError for a pattern that was not
+        requested."""
+        mesh, rc = self._client.mesh, self.rc(need)
+        over = asyncio.create_task(self.over())
+        try:
+            with closing(mesh.frames(mesh.keys.frame(rc))) as watch:
+                while not over.done():
+                    coming = asyncio.create_task(watch.next(LOOK_AGAIN))
+                    try:
+                        await asyncio.wait((coming, over), return_when=asyncio.FIRST_COMPLETED)
+                    finally:
+                        coming.cancel()
+                    frame = coming.result() if coming.done() and not coming.cancelled() else None
+                    if frame is not None and frame.head.grant in (None, self.grant):
+                        yield frame
+        finally:
+            over.cancel()
+
+    def __repr__(self) -> str:
+        what = f"{self.arc.name}: {', '.join(self.rcs)}"
+        if self.active and not self.completed:
+            left = self.remaining
+            return (
+                f"<{type(self).__name__} {what}; {f'{left:.0f} s left' if left > 0 else 'until somebody waits for it'}>"
+            )
+        ending = self.arc._ending if not self.active else None
+        return f"<{type(self).__name__} {what}; over{f': {ending.reason or ending.outcome}' if ending else ''}>"
 
     async def resumed(self) -> None:
         """Wait while the program is being moved to another host. Returns at once otherwise."""

@@ -16,7 +16,7 @@ import asyncio
 import logging
 import os
 import threading
-from collections.abc import Callable, Coroutine, Mapping
+from collections.abc import AsyncGenerator, AsyncIterator, Callable, Coroutine, Iterator, Mapping
 from concurrent import futures
 from contextlib import AbstractContextManager
 from types import TracebackType
@@ -25,11 +25,13 @@ from typing import Any, Final, Self, TypeVar
 import uvloop
 
 from zscout.behaviors.client.arc import Attempt, Held, Revoked, hold
-from zscout.behaviors.client.client import Client
+from zscout.behaviors.client.client import Client, NoRcm
 from zscout.behaviors.client.interruption import InterruptibleBody, interruptible, uninterrupted
+from zscout.behaviors.client.lab_status import LabStatus
 from zscout.behaviors.client.request import HoldEnd, Needs
 from zscout.config.fleet import Fleet
 from zscout.mesh.exchange import SPAWN
+from zscout.mesh.frames import Frame
 from zscout.mesh.supervision import done_within
 from zscout.types import SECOND, Grant
 
@@ -143,6 +145,21 @@ class BlockingHeld:
         for what this hold does not have, ValueError for a bad reason."""
         self._lab.run(self._held.report_broken(reason, *needs))
 
+    def frames(self, need: str) -> Iterator[Frame]:
+        """Yield the pictures of a held framegrabber as they come, until the hold is over: each time the newest, so that
+        who is slow misses some. Those of another hold are left out. Raises KeyError for a pattern that was not
+        requested."""
+        frames = self._held.frames(need)
+        try:
+            while (frame := self._lab.run(_next(frames))) is not None:
+                yield frame
+        finally:
+            if not self._lab.closed:
+                self._lab.run(_close(frames))
+
+    def __repr__(self) -> str:
+        return repr(self._held).replace("Held", type(self).__name__, 1)
+
     async def _call_when_over(self, callback: Callable[[], object]) -> None:
         over = asyncio.create_task(self._held.over())
         self._watches.add(over)
@@ -157,6 +174,15 @@ class BlockingHeld:
         arc = self._held.arc
         over = HoldEnd("completed", "its minimum runtime is over") if self._held.active else None
         return Revoked(arc, over)
+
+
+async def _next(frames: AsyncIterator[Frame]) -> Frame | None:
+    return await anext(frames, None)
+
+
+async def _close(frames: AsyncIterator[Frame]) -> None:
+    if isinstance(frames, AsyncGenerator):
+        await frames.aclose()
 
 
 class BlockingAttempt(AbstractContextManager[BlockingHeld, None]):
@@ -351,6 +377,24 @@ class Lab:
         back, and the next command raises Revoked. `close`, and the end of this process, give the devices back."""
         attempt = self.hold(name, needs, **how, interrupt=False)
         return attempt.__enter__()
+
+    def status(self) -> LabStatus:
+        """Return the devices of the fleet with their holders, and the requests that wait. Printed it is a table, in a
+        notebook one to look at. Raises NoRcm."""
+        return self.run(self._status())
+
+    async def _status(self) -> LabStatus:
+        await self.client.see_rcm()
+        if (state := await self.client.state()) is None:
+            raise NoRcm(f"the leader of fleet {self.client.fleet.name} did not answer; try again")
+        return LabStatus(self.client.fleet.name, state)
+
+    def __repr__(self) -> str:
+        if self.closed:
+            return f"<{type(self).__name__} closed>"
+        client = self.client
+        leader = f"led by {client.leader}" if client.leader else "without a leader"
+        return f"<{type(self).__name__} {client.mesh.me} in fleet {client.fleet.name}, {leader}>"
 
     def _stop(self) -> None:
         with self._asking:
