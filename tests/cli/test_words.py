@@ -7,9 +7,11 @@ from collections.abc import Iterator
 from datetime import datetime, tzinfo
 from decimal import Decimal
 
+import msgspec
 import pytest
 
 from zscout import terminal
+from zscout.cli.ownership import User
 from zscout.cli.requests.waiting import hold_text, reason_text, whose
 from zscout.messages import HoldView, ReasonInfo, ReasonParty, Who
 from zscout.terminal import clock
@@ -118,4 +120,16 @@ def test_a_reason_is_told_with_times_of_day_where_the_rcm_gave_durations() -> No
     assert reason_text("in words", ReasonInfo("another", ["robot/a"])) == "in words"
     assert reason_text("in words", ReasonInfo("held", ["robot/a", "robot/b"], [party])) == (
         "waits for survey (alice@ws1): robot/a, until 14:34 at the latest"
+    )
+
+
+def test_own_holds_in_the_way_are_called_so() -> None:
+    me, other = User("ada", "desk"), User("bob", "desk")
+    party = ReasonParty(client="desk/request-1", id="i", arc="train", priority=0, who=Who("ada", "desk", "x"))
+    why = ReasonInfo(code="held", rcs=["robot/a"], by=[party], count=1)
+    assert reason_text("", why, me=me) == "waits for your own request train: robot/a"
+    assert reason_text("", why, me=other) == "waits for train (ada@desk): robot/a"
+    assert (
+        reason_text("", msgspec.structs.replace(why, code="maintenance"), me=me)
+        == "maintenance of robot/a by train (ada@desk)"
     )

@@ -80,6 +80,11 @@ def held_by(name: str) -> str:
     return f"{name} ({by('').partition(' ')[0]})"
 
 
+def own(name: str) -> str:
+    """The same, as another one of the same person names it that waits for it."""
+    return f"your own request {name}"
+
+
 def mine(name: str) -> str:
     """A request of a client in this process, and its person."""
     return f"{name} ({ours().partition(' ')[0]})"

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from tests.cli.cli_fleet import CliFleet, fleet_of
-from tests.cli.tools import COMMAND, Terminal, by, course, end, events, held_by, out_of, read_until
+from tests.cli.tools import COMMAND, Terminal, by, course, end, events, held_by, out_of, own, read_until
 from tests.hang import HANG
 
 pytestmark = pytest.mark.live
@@ -25,7 +25,7 @@ def test_a_yes_at_the_terminal_takes_and_ctrl_c_gives_back(fleet: CliFleet) -> N
     survey = fleet.holder("survey", "robot/a", "robot/b", "--priority", "3")
     with fleet.terminal("take", "robot/a", "--reason", "the gripper\x1b is stuck") as terminal:
         shown = terminal.until("Take robot/a? [y/N] ")
-        assert f"operator preempts {held_by('survey')}, priority 3, since " in shown
+        assert f"operator preempts {own('survey')}, priority 3, since " in shown
         assert ": robot/a, robot/b" in shown
         terminal.press("y\n")
         terminal.until("operator holds robot/a: yours for ")
@@ -74,7 +74,7 @@ def test_who_is_asked_sees_whom_it_takes_from_when_the_json_goes_elsewhere(fleet
     script = f'exec {shlex.join(COMMAND)} take robot/a --json > "{out}"'
     with Terminal(command=("sh", "-c", script), env=fleet.lab.env) as terminal:
         shown = terminal.until("Take robot/a? [y/N] ")
-        assert f"operator preempts {held_by('survey')}, priority 0, since " in shown
+        assert f"operator preempts {own('survey')}, priority 0, since " in shown
         assert "{" not in shown
         assert [event["event"] for event in events(out.read_text())] == ["preview"]
         terminal.press("y\n")
@@ -110,9 +110,9 @@ def test_who_shares_may_stay_and_equals_are_waited_for(fleet: CliFleet) -> None:
 def test_a_take_that_must_wait_says_so_and_then_holds(fleet: CliFleet) -> None:
     peer = fleet.holder("peer", "robot/b", "--priority", "10")
     taker, lines = fleet.begun(
-        f"operator waits for {held_by('peer')}: robot/b, until ", "take", "robot/b", "--name", "operator", "--", "true"
+        f"operator waits for {own('peer')}: robot/b, until ", "take", "robot/b", "--name", "operator", "--", "true"
     )
-    assert any(f"operator waits for {held_by('peer')}, priority 10, " in line for line in lines)
+    assert any(f"operator waits for {own('peer')}, priority 10, " in line for line in lines)
     end(peer)
     read_until(taker, "operator holds robot/b")
     assert taker.wait(HANG) == 0

@@ -239,3 +239,17 @@ def test_a_hold_of_a_token_outlives_its_starter_and_a_closed_pipe(fleet: CliFlee
     text = out_of(starting).read()
     assert starting.wait(HANG) == 0
     assert fleet.zscout("run", text.splitlines()[-1], "--", "true").returncode == 0
+
+
+@pytest.mark.slow
+def test_what_is_renewed_lasts_until_another_request_waits(fleet: CliFleet) -> None:
+    token = acquired(fleet, span="2s")
+    assert fleet.zscout("renew", token, "--for", "1h").returncode == 0
+    running, _ = fleet.begun("pid", "run", token, "--", "sh", "-c", POLITE)
+    fleet.state(lambda state: [hold.remaining < -0.5 for hold in state.holds] == [True])
+    assert running.poll() is None
+    assert fleet.zscout("request", "robot/a", "--name", "next", "--", "true").returncode == 0
+    assert running.wait(HANG) == 124
+    assert "next" in out_of(running).read()
+    until(lambda: noted(fleet, token)["ended"])
+    assert fleet.zscout("run", token, "--", "true").returncode == 124

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import pytest
 
 from tests.cli.cli_fleet import CliFleet, fleet_of
-from tests.cli.tools import end, held_by
+from tests.cli.tools import end, held_by, own
 
 pytestmark = pytest.mark.live
 
@@ -23,7 +23,7 @@ def test_it_says_when_it_would_start_and_whom_it_would_preempt(fleet: CliFleet) 
     mine = fleet.holder("mine", "robot/a")
     try:
         take = fleet.zscout("request", "robot/a", "--priority", "5", "--dry-run")
-        assert take.stdout == f"request would start at once\nit would preempt {held_by('mine')}\n"
+        assert take.stdout == f"request would start at once\nit would preempt {own('mine')}\n"
         wait = fleet.zscout("request", "robot/a", "robot/b", "--dry-run", "--json", "--name", "wide")
         told = json.loads(wait.stdout)
         assert (wait.returncode, told["arc"], told["preempts"]) == (0, "wide", [])

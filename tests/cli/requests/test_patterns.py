@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from tests.cli.cli_fleet import CliFleet, fleet_of
-from tests.cli.tools import CLOCK, course, end, events, held_by, out_of, read_until
+from tests.cli.tools import CLOCK, course, end, events, held_by, out_of, own, read_until
 from tests.hang import HANG
 from zscout.cli.operator.take import takeover_cost
 from zscout.cli.requests.options import HoldOptions
@@ -89,15 +89,15 @@ def test_in_a_pipe_and_at_a_terminal_those_in_the_way_are_named_once(fleet: CliF
     first, robot = fleet.holder("first", F1), fleet.holder("robot", "robot/a")
     line = fleet.waits("both", ANY, ANY, until=lambda line: f"; {F1}: " in line)
     times = rf"since {CLOCK} [^;]*, until {CLOCK} [^;]* at the latest"
-    blocker = rf"{F1}: {re.escape(held_by('first'))}, priority 0, {times}"
+    blocker = rf"{F1}: {own('first')}, priority 0, {times}"
     assert re.search(rf"starts at {CLOCK} .*; {blocker}$", line)
     # One framegrabber is free: who has the other is in nobody's way.
     line = fleet.waits("easy", ANY, "robot/a", until=lambda line: "; robot/a: " in line)
-    assert f"; robot/a: {held_by('robot')}, priority 0, " in line
+    assert f"; robot/a: {own('robot')}, priority 0, " in line
     assert "framegrabber" not in line
     end(robot)
     with fleet.terminal("request", ANY, ANY, "--name", "both") as terminal:
-        terminal.until(f"  {F1}: {held_by('first')}, priority 0, ")
+        terminal.until(f"  {F1}: {own('first')}, priority 0, ")
         end(first)
         shown = terminal.until("  Ctrl-C gives back")
         assert re.search(r"both holds framegrabber/f1 for framegrabber/\*(#2)?, framegrabber/f2 for ", shown)
@@ -156,7 +156,7 @@ def test_a_dry_run_and_a_take_by_pattern(fleet: CliFleet) -> None:
 
     low, high = fleet.holder("low", F1), fleet.holder("high", ANY, "--priority", "1")
     would = fleet.zscout("request", ANY, "--priority", "5", "--dry-run")
-    assert would.stdout == f"request would start at once\nit would preempt {held_by('low')}\n"
+    assert would.stdout == f"request would start at once\nit would preempt {own('low')}\n"
     assert fleet.zscout("take", ANY).returncode == 1
     taken = fleet.zscout("take", ANY, "--yes", "--no-keep", "--min-runtime", "8", "--json")
     preview, granted, _ = course(taken.stdout)

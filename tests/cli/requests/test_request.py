@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 
 from tests.cli.cli_fleet import CliFleet, fleet_of
-from tests.cli.tools import CLOCK, COMMAND, course, end, events, gone, held_by, out_of, read_until
+from tests.cli.tools import CLOCK, COMMAND, course, end, events, gone, held_by, out_of, own, read_until
 from tests.hang import HANG
 from tests.live.bench import until
 from zscout.behaviors.client.client import QUERY_TIMEOUT, Client
@@ -68,7 +68,7 @@ def test_without_a_command_it_holds_for_its_time(fleet: CliFleet) -> None:
 
 def test_in_a_pipe_it_says_who_is_in_the_way_and_since_when(fleet: CliFleet) -> None:
     blocker = fleet.holder("slow", "robot/a")
-    who = re.escape(held_by("slow"))
+    who = own("slow")
     line = fleet.waits("next", "robot/a", "--", "true", until=lambda line: "; robot/a: " in line)
     assert re.fullmatch(
         rf"next waits for {who}: robot/a, until {CLOCK} at the latest; starts at {CLOCK} \(in (\d\d s|1 min)\); "
@@ -313,10 +313,10 @@ def test_what_can_never_start_is_refused_at_once_with_code_2(fleet: CliFleet) ->
 def test_the_live_line_shows_and_ctrl_c_ends_the_wait(fleet: CliFleet) -> None:
     blocker = fleet.holder("blocker", "robot/a")
     with fleet.terminal("request", "robot/a", "--name", "seen") as terminal:
-        terminal.until(f"seen waits for {held_by('blocker')}: robot/a, until ")
+        terminal.until(f"seen waits for {own('blocker')}: robot/a, until ")
         since = terminal.until("(in ")
         assert re.search(rf"waits since {CLOCK} \(\d+(\.\d)? s\), starts at {CLOCK} ", since)
-        terminal.until(f"robot/a: {held_by('blocker')}, priority 0, ")
+        terminal.until(f"robot/a: {own('blocker')}, priority 0, ")
         terminal.until("seen waits ")  # drawn anew
         terminal.press("\x03")
         terminal.until("seen is cancelled")

@@ -11,7 +11,7 @@ import click
 from zscout.behaviors.client.client import Client
 from zscout.cli import common
 from zscout.cli.common import Parsed
-from zscout.cli.ownership import confirm, yes_option
+from zscout.cli.ownership import User, confirm, yes_option
 from zscout.cli.requests.options import (
     DEFAULT_NAMES,
     CommandAfterDashes,
@@ -68,9 +68,9 @@ class TakeoverCost:
     either: dict[str, list[tuple[str, HoldView]]] = field(default_factory=dict)
     absent: list[str] = field(default_factory=list)
 
-    def lines(self) -> list[str]:
+    def lines(self, me: User | None = None) -> list[str]:
         def text(hold: HoldView) -> str:
-            return hold_text(hold, self.priority)
+            return hold_text(hold, self.priority, me)
 
         return [
             *(f"preempts {text(hold)}: {', '.join(sorted(hold.needs))}" for hold in self.ends),
@@ -144,7 +144,7 @@ async def _agree(client: Client, wanted: HoldOptions, *, yes: bool) -> None:
         possible = sys.stdin.isatty() and sys.stderr.isatty()
         # The JSON may go down a pipe: at a question the words are wanted besides.
         if not wanted.as_json or (asks and possible):
-            for line in cost.lines():
+            for line in cost.lines(User.of(client)):
                 print_line(clean(f"{wanted.name} {line}"), sys.stderr)
         if not asks:
             return

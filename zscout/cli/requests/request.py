@@ -22,7 +22,7 @@ from zscout.cli import common, completion
 from zscout.cli.booked import BOOKING
 from zscout.cli.common import Failed
 from zscout.cli.device_words import unwell
-from zscout.cli.ownership import yes_option
+from zscout.cli.ownership import User, yes_option
 from zscout.cli.requests.options import (
     CommandAfterDashes,
     EventFile,
@@ -391,13 +391,13 @@ async def _foresee(client: Client, wanted: HoldOptions) -> int:
         }
         print_json({"arc": wanted.name, **found})
     else:
-        for line in _words(foretold):
+        for line in _words(foretold, User.of(client)):
             print_line(clean(line))
     return 0 if foretold.starts_in is not None else wanted.own_code(1)
 
 
-def _words(foretold: Foresight) -> Iterator[str]:
-    reason, start = reason_text(foretold.reason, foretold.why), foretold.starts_in
+def _words(foretold: Foresight, me: User) -> Iterator[str]:
+    reason, start = reason_text(foretold.reason, foretold.why, me=me), foretold.starts_in
     if start is None:
         yield f"{foretold.arc} would wait, and no start can be foretold: {reason}"
     elif reason:
@@ -408,7 +408,7 @@ def _words(foretold: Foresight) -> Iterator[str]:
     if start is not None and foretold.begin_within:
         yield f"then it is {starting(foretold.begin_within)}"
     if foretold.preempts:
-        told = [request_words(victim.arc, victim.who, victim.client) for victim in foretold.victims]
+        told = [request_words(victim.arc, victim.who, victim.client, me=me) for victim in foretold.victims]
         yield f"it would preempt {', '.join(told or foretold.preempts)}"
 
 
@@ -489,7 +489,7 @@ class Report(LiveLine):
             await done_within(REFRESH if self.watched else None, self.changed.wait())
 
     def _show_wait(self, arc: OpenArc) -> None:
-        now, start, starts_in = self._mesh.now(), "", None
+        now, start, starts_in, me = self._mesh.now(), "", None, User.of(self._client)
         needs: list[NeedContention] = []
         if arc.start is not None:
             starts_in = round(max(0, arc.start - now) / SECOND, 3)
@@ -508,9 +508,9 @@ class Report(LiveLine):
         # met by one RC: it is listed once.
         met = {rc.rc: rc for need in needs if need.rc or not need.met for rc in need.rcs if rc.holds}
         in_way = [rc for rc in met.values() if not rc.sharable or (arc.why and rc.rc in arc.why.rcs)]
-        holders = [f"{rc.rc}: {'; '.join(hold_text(hold, arc.priority) for hold in rc.holds)}" for rc in in_way]
+        holders = [f"{rc.rc}: {'; '.join(hold_text(hold, arc.priority, me) for hold in rc.holds)}" for rc in in_way]
         holders += [f"{rc.rc}: {rc.lost}" for need in needs if need.rc for rc in need.rcs if rc.lost]
-        words = f"{arc.name} {waits(reason_text(arc.reason, arc.why, (now - arc._told) / SECOND), arc.why)}"
+        words = f"{arc.name} {waits(reason_text(arc.reason, arc.why, (now - arc._told) / SECOND, me), arc.why)}"
         ahead = f"{arc.ahead} ahead" if arc.ahead else ""
         waited = self._since(arc)
         since = ", ".join(filter(None, (f"waits since {clock(-waited)} ({span(waited)})", ahead, start)))

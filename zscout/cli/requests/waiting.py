@@ -6,15 +6,19 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from decimal import Decimal
-from typing import Any
+from typing import Any, Final
 
 from zscout.cli import common
 from zscout.cli.device_words import absence
+from zscout.cli.ownership import User
 from zscout.keyexpr import is_pattern, matcher
 from zscout.messages import HoldView, RcmState, ReasonInfo, ReasonParty, WaitView, Who
-from zscout.scheduling.reason import named, person, reason_of, starting
+from zscout.scheduling.reason import ReasonCode, named, person, reason_of, starting
 from zscout.terminal import clean, clock, span
 from zscout.types import SECOND
+
+
+HOLDERS_IN_WAY: Final = (ReasonCode.HELD, ReasonCode.VETOED)
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,9 +102,17 @@ def whose(view: HoldView | WaitView | ReasonParty) -> str:
     return person(view.who, view.client) + (f" ({clean(command)})" if command else "")
 
 
-def request_words(arc: str, who: Who | None, client: str, params: Mapping[str, Decimal] | None = None) -> str:
-    """The name of a request and its person: `survey (alice@ws1)`, with the `params` under which it holds a device."""
-    return clean(common.with_amounts(named(who, client, arc), params or {}))
+def request_words(
+    arc: str, who: Who | None, client: str, params: Mapping[str, Decimal] | None = None, me: User | None = None
+) -> str:
+    """The name of a request and its person: `survey (alice@ws1)`, with the `params` under which it holds a device; for
+    `me`, whose request it is, `your own request survey`."""
+    name = _own_words(arc) if me is not None and me.owns(client.partition("/")[0], who) else named(who, client, arc)
+    return clean(common.with_amounts(name, params or {}))
+
+
+def _own_words(arc: str) -> str:
+    return f"your own request {clean(arc)}"
 
 
 def comment(who: Who | None) -> str:
@@ -108,22 +120,32 @@ def comment(who: Who | None) -> str:
     return f": {clean(who.comment)}" if who is not None and who.comment else ""
 
 
-def reason_text(reason: str, why: ReasonInfo | None, age: float = 0) -> str:
-    """Why a request waits, in words, `age` seconds after the leader sent it: times of day by this host's clock."""
+def reason_text(reason: str, why: ReasonInfo | None, age: float = 0, me: User | None = None) -> str:
+    """Why a request of `me` waits, in words, `age` seconds after the leader sent it: times of day by this host's
+    clock."""
     known = reason_of(why)
     if known is None:
         return reason
+    if me is not None and known.code in HOLDERS_IN_WAY:
+        known = known._replace(
+            by=tuple(
+                party._replace(label=_own_words(party.name))
+                if me.owns(party.arc.partition("/")[0], party.who)
+                else party
+                for party in known.by
+            )
+        )
     return known.text(lambda until: clock(until / SECOND - age, at_latest=True))
 
 
-def hold_text(hold: HoldView, priority: int) -> str:
-    """Which request holds it, since when and until when, for somebody who asks at this priority."""
-    return hold_words(hold_json(hold), priority)
+def hold_text(hold: HoldView, priority: int, me: User | None = None) -> str:
+    """Which request holds it, since when and until when, for `me`, who asks at this priority."""
+    return hold_words(hold_json(hold), priority, me)
 
 
-def hold_words(hold: Mapping[str, Any], priority: int) -> str:
+def hold_words(hold: Mapping[str, Any], priority: int, me: User | None = None) -> str:
     """The same of a hold as `hold_json` gives it, with `params` if it has any."""
-    holder = request_words(hold["arc"], hold["who"], hold["client"], hold.get("params"))
+    holder = request_words(hold["arc"], hold["who"], hold["client"], hold.get("params"), me)
     since = f"since {clock(-hold['held'])} ({span(hold['held'])})"
     return f"{holder}, priority {hold['priority']}, {since}, {_until(hold, priority)}{comment(hold['who'])}"
 
