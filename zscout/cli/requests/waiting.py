@@ -17,7 +17,6 @@ from zscout.scheduling.reason import ReasonCode, named, person, reason_of, start
 from zscout.terminal import clean, clock, span
 from zscout.types import SECOND
 
-
 HOLDERS_IN_WAY: Final = (ReasonCode.HELD, ReasonCode.VETOED)
 
 
