@@ -183,3 +183,71 @@ def test_what_is_smaller_than_asked_for_is_left_out(min_area: float, told: bool)
 def test_what_is_shorter_than_asked_for_is_left_out(min_duration: float, told: bool) -> None:
     scene, limits = Scene(29), MotionLimits(min_duration=min_duration)
     assert bool([*events(lambda _, walker: scene.picture(walker), limits=limits)]) == told
+
+
+def falling(
+    seed: int, drops: int, draw: Callable[[Picture, int, int, np.random.Generator], None], lit: float
+) -> Camera:
+    """Somewhere else in each picture; `lit` is the part of the light behind a drop that it replaces."""
+    scene, rng = Scene(seed), np.random.default_rng(seed)
+
+    def camera(time: float, walker: float | None) -> Picture:
+        layer: Picture = np.zeros((4 * HEIGHT, 4 * WIDTH), np.uint8)
+        for _ in range(drops):
+            draw(layer, int(rng.integers(4 * WIDTH)), int(rng.integers(4 * HEIGHT)), rng)
+        cover = lit / 255 * cv2.resize(layer, (WIDTH, HEIGHT), interpolation=cv2.INTER_AREA).astype(np.float32)
+        return ((1 - cover) * scene.picture(walker) + cover * 225).astype(np.uint8)
+
+    return camera
+
+
+@pytest.mark.parametrize(
+    ("drops", "length", "slant", "thick"),
+    [
+        (4, (15, 40), 0.17, 1),
+        (15, (15, 40), 0.17, 1),
+        (60, (15, 40), -0.5, 1),
+        (120, (15, 40), 0.17, 1),
+        (20, (40, 90), 1.0, 1),
+        (20, (40, 90), 0.1, 2),
+        (25, (6, 12), 3.0, 2),
+    ],
+)
+def test_rain_is_no_motion_and_the_walker_in_it_is(
+    drops: int, length: tuple[int, int], slant: float, thick: int
+) -> None:
+    def streak(layer: Picture, x: int, y: int, rng: np.random.Generator) -> None:
+        high = int(rng.integers(*length))
+        cv2.line(layer, (x, y), (int(x + slant * high), y + high), (255,), thick)
+
+    assert_walker_alone(falling(30, drops, streak, 0.5))
+
+
+@pytest.mark.parametrize(("flakes", "most"), [(5, 8), (12, 12), (40, 5), (150, 5), (30, 9)])
+def test_snow_is_no_motion_and_the_walker_in_it_is(flakes: int, most: int) -> None:
+    def flake(layer: Picture, x: int, y: int, rng: np.random.Generator) -> None:
+        cv2.circle(layer, (x, y), int(rng.integers(1, most)), (255,), -1)
+
+    assert_walker_alone(falling(31, flakes, flake, 0.9))
+
+
+def test_rain_that_begins_and_ends_is_no_motion_either() -> None:
+    def streak(layer: Picture, x: int, y: int, rng: np.random.Generator) -> None:
+        cv2.line(layer, (x, y), (x + 5, y + int(rng.integers(15, 40))), (255,), 1)
+
+    wet, dry = falling(32, 15, streak, 0.5), falling(32, 0, streak, 0.5)
+    assert_walker_alone(lambda time, walker: (wet if 3 <= time < 4.5 or time > 8 else dry)(time, walker))
+
+
+def test_people_who_run_about_are_no_rain() -> None:
+    """Five of them, twice a second: nobody covers any of where he was."""
+    scene = Scene(33)
+    detector, rng = settled(scene), np.random.default_rng(1)
+    moving = []
+    for number in range(10):
+        picture = scene.picture()
+        for place in range(5):
+            left, top = 32 * place + int(rng.integers(0, 24)), int(rng.integers(40, 90))
+            picture[top : top + 18, left : left + 7] = 20
+        moving.append(detector.see(4 + number / 2, picture).moving)
+    assert sum(moving) >= 8

@@ -12,6 +12,7 @@ flicker, exposure and slow light changes are no motion.
 - A change of most of the picture at once is a switched light or a moved camera: it is learned at once. Somebody
 close to the lens is not: he grew.
 - What is small and stands where it came is no motion: a clock in the picture.
+- Drops of rain and flakes of snow are in one picture each (`rain.py`).
 - Motion needs two of three pictures at about the same place, or one that is upright and clear.
 
 Whatever stays is learned as that pixel's noise: a person who stops is no motion after a second or two, and leaves no
@@ -28,6 +29,7 @@ from numpy.typing import NDArray
 
 from zscout.behaviors.perception.outline import Mask, Outlines
 from zscout.behaviors.perception.presence import Presence
+from zscout.behaviors.perception.rain import Rain
 from zscout.messages import MotionLimits
 
 WIDTH: Final = 160  # columns of the analysed picture; larger ones are reduced to it
@@ -182,6 +184,7 @@ class MotionDetector:
         self._near: _Near | None = None
         self._light = 1.0, 0.0  # gain and offset of the last picture against the background
         self._middle = 0.0  # median deviation of the last picture
+        self._rain = Rain()
         self._sightings: deque[tuple[float, NDArray[np.uint8], NDArray[np.uint8], _Plane]] = deque(maxlen=RECENT - 1)
 
     def see(self, time: float, picture: Picture) -> Seen:
@@ -219,13 +222,14 @@ class MotionDetector:
             self._learn(away, None, 1.0 / self._pictures, 1.0)
             return Seen(False, learning=True), None
         score, middle = self._score(away)
-        mask, regions, clear = self._regions(score, level)
+        mask, regions, clear = self._regions(score, level, time)
         share = np.count_nonzero(mask) / (mask.size if self._ignored is None else max(1, np.sum(self._ignored == 0)))
         noise = float(np.median(self._variance[::4, ::4])) ** 0.5
         stirs = self._near is not None and self._near.stirs(time, level, mask, noise)
         if middle > ALL_OFF or (share > UPHEAVAL and not stirs):
             return self._begin(time, grey), None
-        self._learn(away, mask, passed / LEARN, 0.0 if stirs else passed / ABSORB)
+        drops = self._rain.drops
+        self._learn(away, mask if drops is None else mask | drops, passed / LEARN, 0.0 if stirs else passed / ABSORB)
         largest = sorted(regions.tolist(), key=lambda region: -region[cv2.CC_STAT_AREA])[:MAX_BOXES]
         height, width = picture.shape[:2]
         boxes = tuple(
@@ -238,12 +242,16 @@ class MotionDetector:
             for x, y, w, h, _ in largest
         )
         moving = self._sure(time, mask, level, noise) or any(
-            not self._stands_aside(level, region) for region in clear.tolist()
+            not self._rain.pictures and drops is None and not self._stands_aside(level, region)
+            for region in clear.tolist()
         )
         if not moving or share < NEAR:
             self._near = None
         elif self._near is None:
             self._near = _Near(time, level, mask)
+        if drops is not None and not moving:
+            # A drop that nothing confirms begins no event.
+            boxes = ()
         noise = _noise(grey) if self._presence.expects(moving) else 0.0
         present = self._presence.see(time, level, self._mean, mask if moving else None, noise)
         return Seen(moving, boxes, present=present), mask
@@ -259,6 +267,7 @@ class MotionDetector:
         self._sightings.clear()
         self._presence.clear()
         self._near = None
+        self._rain = Rain()
         if self._pictures < WARM_PICTURES:
             self._mean = np.empty((0, 0), np.float32)
         elif not self._paused:
@@ -270,7 +279,7 @@ class MotionDetector:
         if self._back is None or passed >= AGREE[1]:
             self._back = time
         score, middle = self._score(away)
-        mask, _, _ = self._regions(score, level)
+        mask, _, _ = self._regions(score, level, time)
         changed = np.count_nonzero(mask) / mask.size
         alike = 1 / ALIKE <= _noise(grey) / max(self._noise, 1e-3) <= ALIKE
         if not alike or middle > ALL_OFF or changed > CHANGED:
@@ -314,6 +323,7 @@ class MotionDetector:
         self._sightings.clear()
         self._presence.clear()
         self._near = None
+        self._rain = Rain()
         return Seen(False, learning=True)
 
     def _hidden(self) -> NDArray[np.uint8] | None:
@@ -346,11 +356,12 @@ class MotionDetector:
         self._mean += rate * away
         self._variance += rate * (away * away - self._variance)
 
-    def _regions(self, score: _Plane, level: _Plane) -> tuple[NDArray[np.uint8], _Regions, _Regions]:
+    def _regions(self, score: _Plane, level: _Plane, time: float) -> tuple[NDArray[np.uint8], _Regions, _Regions]:
         """Connected pixels above WEAK with some above STRONG: mask (255 or 0), stats, and stats of certain regions."""
         weak = (score > WEAK).astype(np.uint8)
         # Torn lines and hot pixels are thinner than anything that moves.
-        thick = cv2.morphologyEx(weak, cv2.MORPH_OPEN, np.ones((3, 2), np.uint8))
+        thick = np.asarray(cv2.morphologyEx(weak, cv2.MORPH_OPEN, np.ones((3, 2), np.uint8)), np.uint8)
+        thick = self._rain.without_drops(time, thick, SMALLEST * thick.size)
         weak = np.asarray(cv2.morphologyEx(thick, cv2.MORPH_CLOSE, np.ones((7, 5), np.uint8)), np.uint8)
         count, labels, found, _ = cv2.connectedComponentsWithStats(weak, connectivity=8)
         stats: _Regions = np.asarray(found, np.int32)
@@ -383,7 +394,7 @@ class MotionDetector:
             fresh |= mask & ~_around(before)
         # What stands confirms nothing later either.
         self._sightings.append((time, fresh, mask, level))
-        return bool(np.any(mask)) and 1 + agree >= SURE
+        return bool(np.any(mask)) and 1 + agree >= (SURE if self._rain.drops is None else RECENT)
 
 
 def _moving(mask: NDArray[np.uint8], off: _Plane, noise: float) -> NDArray[np.uint8]:

@@ -1,0 +1,64 @@
+"""Rain and snow: many small regions, each in one picture only, all the time. Pure.
+
+A drop is somewhere else in the next picture, a person still covers part of where he was. While it rains, only regions
+count that do so and are larger than the drops, or that are much larger."""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+DROP: Final = 6  # pixels of the smallest drop or flake that counts
+LASTS: Final = 0.3  # largest share of a drop that was in the picture before too
+PARTS: Final = (4, 3)  # of the picture, across and down: a person in pieces is in few of them
+FALLS: Final = 3  # parts with drops, in each of two pictures in a row, that make rain; ...
+FALLS_FOR: Final = 5.0  # ... seconds without that, after three in a row, after which the rain is over.
+LARGER: Final = 2.0
+MUCH_LARGER: Final = 5.0
+"""Multiples of the median drop from which a region is no drop: if it covers part of where it was, and in any case."""
+OFTEN: Final = 0.35  # most seconds between two pictures that show what lasts
+
+Regions = NDArray[np.uint8]  # 0 or 1
+
+
+class Rain:
+    def __init__(self) -> None:
+        self.drops: Regions | None = None  # of the last picture; None without rain
+        self._before: Regions | None = None
+        self.pictures = 0  # in a row, up to the last, with so many drops
+        self._until = self._last = -math.inf
+
+    def without_drops(self, time: float, regions: Regions, smallest: float) -> Regions:
+        """The regions that are no drops; all of them without rain. Regions that matter have `smallest` pixels."""
+        before, self._before, self.drops = self._before, regions, None
+        passed, self._last = time - self._last, time
+        if OFTEN < passed < math.inf:
+            self.pictures = 0
+            return regions
+        count, labels, stats, middles = cv2.connectedComponentsWithStats(regions, connectivity=8)
+        area = stats[:, cv2.CC_STAT_AREA]
+        lasts = np.zeros(count, np.intp)
+        if before is not None and before.shape == regions.shape:
+            lasts = np.bincount(labels[before > 0], minlength=count)
+        counts = area >= DROP
+        counts[0] = False
+        fresh = counts & (lasts < LASTS * area)
+        across, down = PARTS[0] / regions.shape[1], PARTS[1] / regions.shape[0]
+        places = {(int(x * across), int(y * down)) for x, y in middles[fresh].tolist()}
+        # Among many people there are always some pieces.
+        enough = 2 * np.count_nonzero(fresh) >= np.count_nonzero(counts)
+        self.pictures = self.pictures + 1 if enough and len(places) >= FALLS else 0
+        if self.pictures > 2:
+            self._until = time + FALLS_FOR
+        if self.pictures < 2 and time > self._until:
+            return regions
+        drop = float(np.median(area[fresh])) if places else 0.0
+        moves = (lasts >= max(smallest, drop)) & (area >= LARGER * drop) | (area >= max(smallest, MUCH_LARGER * drop))
+        moves[0] = False
+        moving = np.asarray(moves[labels], np.uint8)
+        self.drops = regions - moving
+        return moving
