@@ -6,7 +6,7 @@ READY := $(VENV)/.ready
 PEERS := .venv-peers
 PEERS_READY := $(PEERS)/.ready
 
-.PHONY: help setup demo test test-all docs pictures lint bench bench-peers model install-check chaos soak lock clean
+.PHONY: help setup programs demo test test-all docs pictures lint bench bench-peers model install-check chaos soak lock clean
 
 help:
 	@echo "make demo   four robots in a simulated building hide and watch, on a live mesh"
@@ -18,6 +18,7 @@ help:
 	@echo "make pictures   the pictures of README and docs; needs a Vulkan driver"
 	@echo "make bench  latencies as ratios to a bare Zenoh query"
 	@echo "make model  what the model checker TLC says of the models in formal/; needs a Java runtime"
+	@echo "make programs  install what the tests of notebooks and web servers need; without it they skip"
 	@echo "make chaos  20 minutes of faults in a real fleet, held against docs/promises.md; needs root, network namespaces, iproute2"
 	@echo "make soak HOURS=8   that long live and simulated: memory, links, descriptors, latency; needs what make chaos does"
 	@echo "make bench-peers   the same work done by Dask, Redis, etcd, labgrid and Ray"
@@ -30,6 +31,10 @@ $(READY): requirements/dev.txt pyproject.toml
 	@touch $@
 
 setup: $(READY)
+
+# What tests of notebooks and web servers need; without it they skip.
+programs: $(READY)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements/programs.txt
 
 demo: $(READY)
 	$(BIN)/zscout demo
@@ -94,6 +99,7 @@ lock:
 	$(LOCK) --constraints requirements/dev.txt --group light -o requirements/light.txt
 	$(LOCK) --constraints requirements/dev.txt --extra metrics --extra notify pyproject.toml -o requirements/full.txt
 	$(LOCK) --group installers -o requirements/installers.txt
+	$(LOCK) --constraints requirements/dev.txt --group programs -o requirements/programs.txt
 
 clean:
 	rm -rf $(VENV) $(PEERS) .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -52,6 +52,8 @@ class BlockingHeld:
         self._lab, self._held, self._attempt = lab, held, attempt
         self._body = InterruptibleBody(self._revoked)
         self._raised = False
+        self._ending: HoldEnd | None = None
+        """How it was taken away."""
         self._watches: set[asyncio.Task[None]] = set()
 
     @property
@@ -172,7 +174,7 @@ class BlockingHeld:
     def _revoked(self) -> Revoked:
         self._raised = True
         arc = self._held.arc
-        over = HoldEnd("completed", "its minimum runtime is over") if self._held.active else None
+        over = HoldEnd("completed", "its minimum runtime is over") if self._held.active else self._ending
         return Revoked(arc, over)
 
 
@@ -197,9 +199,10 @@ class BlockingAttempt(AbstractContextManager[BlockingHeld, None]):
     def __enter__(self) -> BlockingHeld:
         try:
             self._held = BlockingHeld(self._lab, self._lab.run(self._granted()), self)
-            if self._interrupt and interruptible():
+            interrupts = self._interrupt and interruptible()
+            if interrupts:
                 self._held._body.enter()
-                self._lab.run(self._watch_over(self._held))
+            self._lab.run(self._watch_over(self._held, interrupts=interrupts))
         except BaseException:
             self._leave()
             raise
@@ -235,20 +238,31 @@ class BlockingAttempt(AbstractContextManager[BlockingHeld, None]):
         await self._lab.client.see_rcm()
         return await self._attempt.granted()
 
-    async def _watch_over(self, held: BlockingHeld) -> None:
-        self._watch = asyncio.create_task(self._interrupt_when_over(held))
+    async def _watch_over(self, held: BlockingHeld, *, interrupts: bool) -> None:
+        self._watch = asyncio.create_task(self._when_over(held, interrupts=interrupts))
 
-    async def _interrupt_when_over(self, held: BlockingHeld) -> None:
+    async def _when_over(self, held: BlockingHeld, *, interrupts: bool) -> None:
         direct = self._lab.client.internals.direct_hold(held.grant)
         await held._held.over()
-        await held._body.interrupt()
-        if direct is not None:
+        if direct is None:
+            await self._give_up(held)
+        if interrupts:
+            await held._body.interrupt()
+        if interrupts and direct is not None:
             await asyncio.sleep(max(0, direct.gone_by - held._held.now()) / SECOND)
             log.warning(
                 "%s cleans up too long after its hold; interrupting it, the next holder begins", direct.arc.name
             )
             held._body.told = False
             await held._body.interrupt()
+
+    async def _give_up(self, held: BlockingHeld) -> None:
+        """Leave the queue: a hold that this one was granted again would be nobody's until the body is left."""
+        arc = held._held.arc
+        if not held.completed:
+            held._ending = arc._ending
+            if arc.open:
+                await self._lab.client.end(arc)
 
     async def _end(self) -> None:
         if self._watch is not None:
