@@ -224,7 +224,8 @@ class MotionDetector:
         score, middle = self._score(away)
         mask, regions, clear = self._regions(score, level, time)
         share = np.count_nonzero(mask) / (mask.size if self._ignored is None else max(1, np.sum(self._ignored == 0)))
-        noise = float(np.median(self._variance[::4, ::4])) ** 0.5
+        # Nothing asks for it where nothing moves.
+        noise = float(np.median(self._variance[::4, ::4])) ** 0.5 if share or self._near is not None else 0.0
         stirs = self._near is not None and self._near.stirs(time, level, mask, noise)
         if middle > ALL_OFF or (share > UPHEAVAL and not stirs):
             return self._begin(time, grey), None
@@ -362,6 +363,9 @@ class MotionDetector:
         # Torn lines and hot pixels are thinner than anything that moves.
         thick = np.asarray(cv2.morphologyEx(weak, cv2.MORPH_OPEN, np.ones((3, 2), np.uint8)), np.uint8)
         thick = self._rain.without_drops(time, thick, SMALLEST * thick.size)
+        if not thick.any():
+            none: _Regions = np.zeros((0, 5), np.int32)
+            return np.zeros(score.shape, np.uint8), none, none
         weak = np.asarray(cv2.morphologyEx(thick, cv2.MORPH_CLOSE, np.ones((7, 5), np.uint8)), np.uint8)
         count, labels, found, _ = cv2.connectedComponentsWithStats(weak, connectivity=8)
         stats: _Regions = np.asarray(found, np.int32)

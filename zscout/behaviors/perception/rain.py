@@ -39,6 +39,9 @@ class Rain:
         if OFTEN < passed < math.inf:
             self.pictures = 0
             return regions
+        if not regions.any():
+            self.pictures, self.drops = 0, regions if time <= self._until else None
+            return regions
         count, labels, stats, middles = cv2.connectedComponentsWithStats(regions, connectivity=8)
         area = stats[:, cv2.CC_STAT_AREA]
         lasts = np.zeros(count, np.intp)
