@@ -188,6 +188,10 @@ def write(path: Path, content: TokenFile) -> None:
 
 def remove(path: Path) -> None:
     path.unlink(missing_ok=True)
+    remove_socket(path)
+
+
+def remove_socket(path: Path) -> None:
     _socket_of(path).unlink(missing_ok=True)
 
 

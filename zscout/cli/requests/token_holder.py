@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import asyncio
 import os
+import socket
 import sys
 from contextlib import suppress
 from pathlib import Path
@@ -70,6 +71,7 @@ class TokenHolder:
         self._releasing: list[TokenChannel] = []
         self._ending: asyncio.Future[TokenEnding] = asyncio.get_running_loop().create_future()
         self._changed = asyncio.Event()
+        self._server: socket.socket | None = None
         self._talks: set[asyncio.Task[None]] = set()
         if self._direct is not None:
             self._direct.watch(self._follow)
@@ -88,8 +90,8 @@ class TokenHolder:
                     await asyncio.wait((self._ending,), timeout=max(0.0, min(left, LOOK_AT_FILE)))
                 return self._ending.result()
         finally:
-            loop.remove_reader(server)
-            server.close()
+            # `close` ends the server, when the file says how the hold has ended.
+            self._server = server
             if followed is not None:
                 loop.remove_reader(followed)
 
@@ -115,8 +117,11 @@ class TokenHolder:
     def released(self) -> bool:
         return bool(self._releasing)
 
-    def answer(self, *, gave_back: bool) -> None:
-        """Answer who released the token."""
+    def close(self, *, gave_back: bool) -> None:
+        """Answer those that released the token, and serve it no longer."""
+        if self._server is not None:
+            asyncio.get_running_loop().remove_reader(self._server)
+            self._server.close()
         for channel in self._releasing:
             channel.send(FromHolder("done") if gave_back else FromHolder("refused", why="a command can't be ended"))
 
@@ -263,8 +268,8 @@ async def hold(client: Client, wanted: HoldOptions, seconds: float, follow: int 
                 raise
             if path is not None:
                 _leave_word(path, content, ending, forget=holder.released)
-            holder.answer(gave_back=gave_back)
             report.event("ended", f"{arc.name} gave back {held_text(held)}", reason=ending.why, code=ending.code)
+            holder.close(gave_back=gave_back)
     return 0
 
 
@@ -319,11 +324,11 @@ def _new_file(token: str, client: Client, held: Held) -> tuple[Path, TokenFile]:
 def _leave_word(path: Path, content: TokenFile, ending: TokenEnding, *, forget: bool) -> None:
     """Write how the hold ended, for a later use of the token; nothing if it was released, or its file removed."""
     with suppress(OSError):
-        there = path.exists()
-        token_files.remove(path)
-        if there and not forget:
-            word = msgspec.structs.replace(content, ended=ending.why, code=ending.code)
-            token_files.write(path, word)
+        if forget or not path.exists():
+            token_files.remove(path)
+        else:
+            token_files.write(path, msgspec.structs.replace(content, ended=ending.why, code=ending.code))
+            token_files.remove_socket(path)
 
 
 def _detach(wanted: HoldOptions) -> None:
