@@ -21,9 +21,10 @@ from rerun.chunk import RrdReader
 from benchmarks.stats import Row, table
 from studies.chromium import Chromium, find
 from tests.services.recorder import robot_run
-from zscout.cli.fleet.view import free_port, open_viewer
+from zscout.cli.fleet.view import open_viewer
 from zscout.config.fleet import MeshConfig, default_fleet
 from zscout.config.node import RecorderConfig
+from zscout.ports import free_port
 from zscout.services.recorder.blueprint import Layout
 from zscout.services.recorder.drawing import Drawing
 from zscout.services.recorder.process import RecorderJob, Recording, encode_job
