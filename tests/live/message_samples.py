@@ -37,8 +37,8 @@ def sample(kind: inspect.Type, turn: int) -> Any:
             return sample(types[turn % len(types)], turn)
         case inspect.LiteralType(values=values):
             return values[turn % len(values)]
-        case inspect.ListType(item_type=of) | inspect.VarTupleType(item_type=of):
-            return [sample(of, turn)]
+        case inspect.ListType(item_type=of, min_length=least) | inspect.VarTupleType(item_type=of, min_length=least):
+            return [sample(of, turn)] * max(1, least or 0)
         case inspect.TupleType(item_types=types):
             return [sample(of, turn) for of in types]
         case inspect.DictType(key_type=named, value_type=of):
