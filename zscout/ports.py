@@ -10,13 +10,14 @@ from typing import Final
 
 GIVEN_AWAY: Final = Path("/proc/sys/net/ipv4/ip_local_port_range")
 """The ports that Linux gives to outgoing connections, and to servers that ask for any."""
-LOWEST, HIGHEST = 10_000, 32_768
+LOWEST: Final = 10_000
+HIGHEST: Final = 32_768
 TRIES: Final = 100
 
 
 def free_port(bind: str, *ports: int) -> int:
-    """The first of these ports on this IP address that nobody listens on. 0: any, a random one below those that the
-    system gives away by itself, so that no connection which is made meanwhile gets it. Raises OSError."""
+    """Return the first of these ports that is free on this IP address. 0 stands for any: a random port below those that
+    the system assigns to connections, so that it stays free until the server starts. Raises OSError."""
     error = OSError("no port was given")
     for port in ports:
         for number in [port] if port else [*_any(), 0]:

@@ -313,18 +313,20 @@ class Operations:
 
     def _may_hold(self, arc: ArcId, ask: Ask) -> bool:
         """Whether its client believes in a grant of an earlier RCM of which this one does not know."""
-        if ask.grant is None or ask.grant.term >= self.core.term or ask.unconfirmed or ask.unserved:
-            return False
         known = self.core.arc(arc)
-        return (known is None or known.hold is None) and not self._registry.ended(arc)
+        return self._believes(ask) and (known is None or known.hold is None) and not self._registry.ended(arc)
+
+    def _believes(self, ask: Ask) -> bool:
+        """Return True if its client believes in a grant of an earlier RCM."""
+        return ask.grant is not None and ask.grant.term < self.core.term and not (ask.unconfirmed or ask.unserved)
 
     def _denied(self, arc: ArcId, ask: Ask, sender: Sender) -> model.Vouched | None:
         """The word of a client that believes in another grant of an earlier RCM than an RC has reported, and for other
         RCs; None: it is not so."""
         known = self.core.arc(arc)
-        if known is None or known.vouched or known.hold is None or ask.grant in (None, known.hold.grant):
+        if known is None or known.vouched or known.hold is None or known.hold.grant == ask.grant:
             return None
-        if ask.grant.term >= self.core.term or ask.unconfirmed or ask.unserved:
+        if not self._believes(ask):
             return None
         word = vouched(known, Listed(self._admission.form(ask, sender), None), self._admission)
         return word if word.bound is None else None

@@ -67,8 +67,9 @@ class _Request:
     until: Ns | None = None
     """It ended, and is remembered until then."""
     believed: Collection[RcName] = ()
-    believes: Grant | None = None
-    """RCs that its client believes to hold since an earlier term, which may yet report that."""
+    """RCs that its client believes to hold since an earlier term, which may yet report that, ..."""
+    believed_grant: Grant | None = None
+    """... and by which grant."""
     foretold: Ns | None = None
     """The first start that its client was notified of."""
 
@@ -112,7 +113,7 @@ class RequestLog:
     def believe(self, arc: ArcId, grant: Grant, rcs: Collection[RcName]) -> None:
         """The client of a waiting ARC believes that it holds these RCs by this grant."""
         known = self._requests[arc]
-        known.believes, known.believed = grant, rcs
+        known.believed_grant, known.believed = grant, rcs
 
     def name(self, arc: ArcId) -> str:
         known = self._requests.get(arc)
@@ -132,11 +133,16 @@ class RequestLog:
             return False
         return self._roster.awaits(now, arc, known.believed)
 
+    def _is_vouched(self, arc: ArcId) -> bool:
+        """Return True if `arc` is open by its client's word: without it, what an RC reported may be another's."""
+        status = self._core.arc(arc)
+        return status is not None and status.vouched
+
     def _is_of_another(self, now: Ns, ended: HoldEnded) -> bool:
         """Return True if an RC had reported this hold, and the ARC's client believes in one that RCs may yet report."""
         known = self._requests.get(ended.arc)
-        believes = None if known is None else known.believes
-        return believes not in (None, ended.grant) and self.may_be_held(now, ended.arc)
+        believed = None if known is None else known.believed_grant
+        return believed not in (None, ended.grant) and self.may_be_held(now, ended.arc)
 
     def reopens(self, arc: ArcId, unserved: Grant | None = None) -> bool:
         """Return True if `arc` ended only because its client seemed lost, or had its time under the grant `unserved`
@@ -241,15 +247,14 @@ class RequestLog:
                         if known.foretold is not None:
                             self.foretold[arc] = known.foretold
                         known.ending = known.foretold = None
-                    # An ARC that ended in the same instant has only that notice; a client whose word is awaited
-                    # may know of another hold.
-                    status = self._core.arc(arc)
-                    if arc not in answered and status is not None and status.vouched:
+                    # An ARC that ended in the same instant has only that notice.
+                    if arc not in answered and self._is_vouched(arc):
                         notices.append(self.notice(now, arc))
                 case HoldTimed(arc=arc, waits=waits) if self._core.is_running(arc):
                     about = "is ready: its devices have begun" if waits is None else starting((waits - now) / SECOND)
                     self.record(now, arc, about)
-                    notices.append(self.notice(now, arc))
+                    if self._is_vouched(arc):
+                        notices.append(self.notice(now, arc))
                 case HoldEnded(arc=arc) | Dropped(arc=arc):
                     notice = self._close(now, effect)
                     if isinstance(effect, HoldEnded) and self._is_of_another(now, effect):

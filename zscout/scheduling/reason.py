@@ -185,6 +185,10 @@ def ended(outcome: str, reason: str, why: Reason | ReasonInfo | None) -> str:
     return reason if why is not None and why.code in _OUTCOMES else f"{word}: {reason}" if reason else word
 
 
+KEPT: Final = "until somebody waits for it"
+"""How long a hold goes on after its minimum runtime, if it is kept."""
+
+
 def starting(left: float) -> str:
     """A hold whose devices have begun in `left` seconds at the latest."""
     return f"starting, ready in about {max(1, round(left))} s"

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import AsyncIterator, Mapping
+from collections.abc import AsyncGenerator, AsyncIterator, Mapping
 from contextlib import closing, suppress
 from decimal import Decimal
 from typing import Any, Final
@@ -24,6 +24,7 @@ from zscout.behaviors.client.request import CommandRefused, HoldEnd, Needs, Open
 from zscout.keyexpr import is_pattern
 from zscout.mesh.frames import Frame
 from zscout.messages import Done
+from zscout.scheduling.reason import KEPT
 from zscout.types import SECOND, Grant, Ns
 
 log = logging.getLogger(__name__)
@@ -130,7 +131,7 @@ class Held:
         known = done.result.get("seconds") if isinstance(done.result, dict) else None
         return float(known) if isinstance(known, int | float) else 0.0
 
-    async def frames(self, need: str) -> AsyncIterator[Frame]:
+    async def frames(self, need: str) -> AsyncGenerator[Frame, None]:
         """Yield the pictures of a held framegrabber as they come, until the hold is over: each time the newest, so that
         who is slow misses some. Those of another hold are left out. Raises KeyError for a pattern that was not
         requested."""
@@ -144,21 +145,23 @@ class Held:
                         await asyncio.wait((coming, over), return_when=asyncio.FIRST_COMPLETED)
                     finally:
                         coming.cancel()
-                    frame = coming.result() if coming.done() and not coming.cancelled() else None
-                    if frame is not None and frame.head.grant in (None, self.grant):
+                    if coming.done() and (frame := coming.result()) and frame.head.grant in (None, self.grant):
                         yield frame
         finally:
             over.cancel()
 
     def __repr__(self) -> str:
-        what = f"{self.arc.name}: {', '.join(self.rcs)}"
+        return f"<{type(self).__name__} {self.words}>"
+
+    @property
+    def words(self) -> str:
+        """The request, the devices, and how long they are held or why no longer."""
         if self.active and not self.completed:
-            left = self.remaining
-            return (
-                f"<{type(self).__name__} {what}; {f'{left:.0f} s left' if left > 0 else 'until somebody waits for it'}>"
-            )
-        ending = self.arc._ending if not self.active else None
-        return f"<{type(self).__name__} {what}; over{f': {ending.reason or ending.outcome}' if ending else ''}>"
+            stands = f"{self.remaining:.0f} s left" if self.remaining > 0 else KEPT
+        else:
+            ending = None if self.active else self.arc._ending
+            stands = f"over: {ending.reason or ending.outcome}" if ending is not None else "over"
+        return f"{self.arc.name}: {', '.join(self.rcs)}; {stands}"
 
     async def resumed(self) -> None:
         """Wait while the program is being moved to another host. Returns at once otherwise."""

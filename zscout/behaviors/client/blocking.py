@@ -16,7 +16,7 @@ import asyncio
 import logging
 import os
 import threading
-from collections.abc import AsyncGenerator, AsyncIterator, Callable, Coroutine, Iterator, Mapping
+from collections.abc import AsyncGenerator, Callable, Coroutine, Iterator, Mapping
 from concurrent import futures
 from contextlib import AbstractContextManager
 from types import TracebackType
@@ -160,7 +160,7 @@ class BlockingHeld:
                 self._lab.run(_close(frames))
 
     def __repr__(self) -> str:
-        return repr(self._held).replace("Held", type(self).__name__, 1)
+        return f"<{type(self).__name__} {self._held.words}>"
 
     async def _call_when_over(self, callback: Callable[[], object]) -> None:
         over = asyncio.create_task(self._held.over())
@@ -178,13 +178,12 @@ class BlockingHeld:
         return Revoked(arc, over)
 
 
-async def _next(frames: AsyncIterator[Frame]) -> Frame | None:
+async def _next(frames: AsyncGenerator[Frame, None]) -> Frame | None:
     return await anext(frames, None)
 
 
-async def _close(frames: AsyncIterator[Frame]) -> None:
-    if isinstance(frames, AsyncGenerator):
-        await frames.aclose()
+async def _close(frames: AsyncGenerator[Frame, None]) -> None:
+    await frames.aclose()
 
 
 class BlockingAttempt(AbstractContextManager[BlockingHeld, None]):
@@ -257,7 +256,7 @@ class BlockingAttempt(AbstractContextManager[BlockingHeld, None]):
             await held._body.interrupt()
 
     async def _give_up(self, held: BlockingHeld) -> None:
-        """Leave the queue: a hold that this one was granted again would be nobody's until the body is left."""
+        """Leave the queue: if it were granted again, no body would use that hold."""
         arc = held._held.arc
         if not held.completed:
             held._ending = arc._ending

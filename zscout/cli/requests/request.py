@@ -39,7 +39,7 @@ from zscout.cli.requests.waiting import NeedContention, contention_of, hold_text
 from zscout.config.strict import BadInput
 from zscout.mesh.supervision import done_within
 from zscout.messages import Foresight, RcmState, RcState, StateAsk, version_words
-from zscout.scheduling.reason import ReasonCode, starting, waits
+from zscout.scheduling.reason import KEPT, ReasonCode, starting, waits
 from zscout.terminal import LiveLine, clean, clock, print_json, print_line, span
 from zscout.types import SECOND, VERSION, Ns
 
@@ -53,7 +53,6 @@ UNDECIDED: Final = (ReasonCode.VOTING, ReasonCode.SEARCHING)
 """How a request waits that may be granted without anything changing."""
 LAST_WORD: Final = 0.5
 """Seconds in which the RCM's word about a hold whose time is over arrives."""
-UNTIL: Final = "until somebody waits for it"
 REFRESH: Final = 1.0
 """Seconds between two looks at who holds what, at least; and where somebody watches, between two pictures."""
 
@@ -371,7 +370,7 @@ def _yours(arc: OpenArc, left: float, longest: Ns | None) -> str:
 
 
 def _kept(longest: Ns | None) -> str:
-    return UNTIL if longest is None else f"{UNTIL}, {span(longest / SECOND)} in all at most"
+    return KEPT if longest is None else f"{KEPT}, {span(longest / SECOND)} in all at most"
 
 
 def ending_of(arc: OpenArc) -> HoldEnd:

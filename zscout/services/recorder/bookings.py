@@ -152,8 +152,9 @@ def _subject(booking: BookingView) -> str:
 
 
 def _named(booking: BookingView) -> str:
-    """What is broken, where that is said, or the booking's name."""
-    return (booking.broken and booking.who is not None and booking.who.comment) or booking.name
+    """The comment of a report of broken devices if it has one, else the booking's name."""
+    comment = booking.who.comment if booking.broken and booking.who is not None else ""
+    return comment or booking.name
 
 
 def _span(date: BookedDate) -> str:
