@@ -72,6 +72,26 @@ async def test_a_command_reboots_the_device_that_it_holds(tmp_path: Path, lab: L
 
 
 @pytest.mark.slow
+async def test_the_events_of_a_token_have_its_unwell_devices(tmp_path: Path, lab: Lab) -> None:
+    down, file = tmp_path / "down", tmp_path / "events.json"
+    lab.node("rcs", extra=board(tmp_path, LONG))
+    client = await lab.client("crew")
+    await lab.ready(client, BOARD)
+    acquired = await lab.zscout("acquire", BOARD, "--for", "1h", "--json-file", str(file))
+    assert acquired.returncode == 0, acquired.stderr
+
+    def written() -> list[str]:
+        return [json.loads(line)["event"] for line in file.read_text().splitlines()]
+
+    down.touch()
+    await until(lambda: "unwell" in written())
+    down.unlink()
+    await until(lambda: "well" in written())
+    released = await lab.zscout("release", acquired.stdout.strip())
+    assert released.returncode == 0, released.stderr
+
+
+@pytest.mark.slow
 async def test_the_leader_dies_while_a_device_is_unwell(tmp_path: Path) -> None:
     async with Lab(tmp_path, candidates=("a", "b")) as lab:
         lab.node("rcs", extra=APART + board(tmp_path, LONG))

@@ -216,7 +216,7 @@ async def _use(client: Client, wanted: HoldOptions, report: Report, arc: OpenArc
         code = None
         if wanted.tolerate is not None:
             await tolerate(wanted.tolerate, report, held)
-        with _reporting_unwell(report, held, client):
+        with reporting_unwell(report, held, client):
             if wanted.command:
                 code = await _run(wanted, report, held, client)
             else:
@@ -257,7 +257,7 @@ async def tolerate(seconds: float, report: Report, held: Held) -> None:
 
 
 @contextmanager
-def _reporting_unwell(report: Report, held: Held, client: Client) -> Iterator[None]:
+def reporting_unwell(report: Report, held: Held, client: Client) -> Iterator[None]:
     """Report when a held device stops working, and when it works again."""
     keys, sick = client.mesh.keys, set[str]()
 

@@ -25,7 +25,16 @@ from zscout.cli import common
 from zscout.cli.common import Failed
 from zscout.cli.requests import token_files
 from zscout.cli.requests.options import HoldOptions
-from zscout.cli.requests.request import TAKEN_AWAY, TIME_OVER, Report, ending_of, held_text, tolerate, wait_for_grant
+from zscout.cli.requests.request import (
+    TAKEN_AWAY,
+    TIME_OVER,
+    Report,
+    ending_of,
+    held_text,
+    reporting_unwell,
+    tolerate,
+    wait_for_grant,
+)
 from zscout.cli.requests.run_command import hold_variables
 from zscout.cli.requests.token_files import FromHolder, ToHolder, TokenChannel, TokenFile, TokenGranted
 from zscout.config.strict import BadInput
@@ -256,7 +265,8 @@ async def hold(client: Client, wanted: HoldOptions, seconds: float, follow: int 
             else:
                 starter.close()
                 _detach(wanted)
-                ending = await holder.until_over(path, followed)
+                with reporting_unwell(report, held, client):
+                    ending = await holder.until_over(path, followed)
         except asyncio.CancelledError:
             if (task := asyncio.current_task()) is not None:
                 task.uncancel()
