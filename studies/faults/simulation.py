@@ -674,7 +674,7 @@ class Simulation:
                     end = lambda: self.network.thaw(mesh)  # noqa: E731
                 else:
                     process.stop()
-                    end = process.go_on
+                    end = process.resume
             case "kill":
                 armed = {name: self.running[name][1] for name in fault.whom if not self.running[name][0].dead}
                 if not armed:

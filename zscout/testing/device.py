@@ -1,4 +1,4 @@
-"""A device for tests of behaviors and components: it records what is done to it, and fails on request."""
+"""A device for tests of behaviors and components: it records calls, and fails on request."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from zscout.drivers.driver import Driver, Holder, Parameter, ProposedHolder, Ref
 class FakeDevice(Driver):
     """A driver that accepts every command.
 
-    Exclusive, unless `sharable`; a sharable one votes `refuses`, which is empty for yes. `answers` has the answers to
-    commands by their names; without one the answer is the command's `value`."""
+    Exclusive unless `sharable`; a sharable device votes `refuses` (a reason; empty for yes). `answers` has answers by
+    command name; other commands are answered with their `value`."""
 
     def __init__(
         self,

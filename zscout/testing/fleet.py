@@ -27,32 +27,32 @@ DEVICES: Final = "devices"
 DESK: Final = "desk"
 """Host of the clients."""
 WITHIN: Final = 60.0
-"""Virtual seconds in which what is waited for must have come true."""
-LOOK: Final = 0.001
-"""Virtual seconds between two looks at a condition."""
+"""Time limit of `until`, in virtual seconds."""
+POLL_S: Final = 0.001
+"""Virtual seconds between two checks of a condition."""
 SAFE_POINT_WITHIN: Final = 5.0
-"""Virtual seconds in which a component comes to a safe point, as on a node."""
+"""Virtual seconds in which a component must reach a safe point, as on a node."""
 
 
 async def until(condition: Callable[[], object], *, within: float = WITHIN) -> None:
     """Wait until `condition()` is true. Raises TimeoutError after `within` virtual seconds."""
     async with asyncio.timeout(within):
         while not condition():  # noqa: ASYNC110 - any condition, of any code
-            await asyncio.sleep(LOOK)
+            await asyncio.sleep(POLL_S)
 
 
 @dataclass(slots=True)
 class ComponentRun:
-    """A component that runs in a MemoryFleet."""
+    """A component running in a MemoryFleet."""
 
     component: Component
     task: asyncio.Task[None]
     gate: SafePointGate
 
     async def checkpoint(self) -> bytes:
-        """Hold it at its next safe point, and return its state. Raises TimeoutError where it comes to none."""
+        """Hold the component at its next safe point, and return its state. Raises TimeoutError if it reaches none."""
         if not await self.gate.hold(SAFE_POINT_WITHIN):
-            raise TimeoutError(f"the component came to no safe point within {SAFE_POINT_WITHIN:g} s")
+            raise TimeoutError(f"the component reached no safe point within {SAFE_POINT_WITHIN:g} s")
         try:
             return self.component.checkpoint()
         finally:
@@ -63,8 +63,8 @@ class ComponentRun:
 class MemoryFleet:
     """The real services of a fleet, one of each, until the end of `async with`.
 
-    `drivers`: by RC name, the driver of each device. `candidates`: hosts that may lead; the first one does so from the
-    beginning. What fails in a service fails the test, at the end of the block."""
+    `drivers`: by RC name, the driver of each device. `candidates`: hosts that may lead; the first leads at the start.
+    The end of the block raises the first error of a service."""
 
     drivers: Mapping[str, Driver] = field(default_factory=dict)
     config: Fleet = field(default_factory=default_fleet)
@@ -114,14 +114,14 @@ class MemoryFleet:
             self._stack.push_async_callback(self._stop, host)
             await until(lambda: self.leader is not None)
         client = self.client()
-        while not self._offered(await client.state()):  # noqa: ASYNC110 - the leader's word comes by a query
-            await asyncio.sleep(LOOK)
+        while not self._all_present(await client.state()):  # noqa: ASYNC110 - the leader is polled by queries
+            await asyncio.sleep(POLL_S)
 
-    def _offered(self, state: RcmState | None) -> bool:
+    def _all_present(self, state: RcmState | None) -> bool:
         return state is not None and self.rcs.keys() <= {view.rc for view in state.rcs if view.present}
 
     def mesh(self, host: str, client: str) -> MemoryMesh:
-        """Open another place on the network."""
+        """Open a mesh for another process on the network."""
         return self.network.open(self.config.name, Sender(host, client))
 
     @property
@@ -138,18 +138,18 @@ class MemoryFleet:
 
     @asynccontextmanager
     async def hold(self, name: str, needs: Needs, *, client: str = "test", **how: Any) -> AsyncIterator[Held]:
-        """`zscout.hold` by the client of that name; `how` are its other arguments."""
+        """`zscout.hold` by the client of that name; `how` has further arguments."""
         async with hold(self.client(client), name, needs, **how) as held:
             yield held
 
     async def holder(self, rc: str) -> str:
-        """Return the request that holds a device, "" if it is free; of a sharable one the first."""
+        """Return the request that holds a device (the first if several share it), or "" if it is free."""
         state = await self.client().state()
         return next((view.arc for view in state.holds if rc in view.needs), "") if state is not None else ""
 
     @asynccontextmanager
     async def running(self, component: Component, name: str = "component") -> AsyncIterator[ComponentRun]:
-        """Run a component on a client of its own, until the end of the block; raises what it raised."""
+        """Run a component with its own client until the end of the block, which raises the component's error."""
         gate, client = SafePointGate(), self.client(f"{name}.1")
         task = asyncio.ensure_future(component.run(ComponentContext(client, name, 1, gate)))
         try:
@@ -160,7 +160,7 @@ class MemoryFleet:
                 await task
 
     async def kill_leader(self) -> None:
-        """Kill the host that leads, and wait until another candidate does. Raises ValueError where there is none."""
+        """Kill the leading host and wait until another candidate leads. Raises ValueError if there is none."""
         host = self.leader
         if host is None or len(self._leading) < 2:
             raise ValueError("give the fleet two candidates, to kill one of them")

@@ -1,7 +1,7 @@
 """A link of the mesh in memory: one direction between two sessions.
 
-It behaves like TCP: what is sent arrives in order; over a link that is cut, or to or from a frozen process, it waits.
-Messages of a kind may be disturbed besides: lost, late, repeated, or answered with an old answer (`Disturbance`)."""
+It behaves like TCP: messages arrive in order, and wait while the link is cut or a process at either end is frozen.
+Messages of chosen kinds may also be lost, late, repeated, or answered with an old answer (`Disturbance`)."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ import msgspec
 from zscout.testing.virtual_time import VirtualTimeLoop
 
 Trace: TypeAlias = Callable[[str, str, str, tuple[Any, ...]], None]
-"""Told of each message that arrives: from which process to which, its kind, and what it is."""
+"""Called for each message that arrives: names of the sending and receiving process, name of the handler, arguments."""
 _NETWORK: Final = Context()
-"""Of the network's own timers: they belong to no process, and its clock is virtual time."""
+"""Context of the network's timers: they belong to no process, and run by virtual time."""
 
 
 @dataclass(frozen=True, slots=True)
 class Disturbance:
-    """How likely a message is lost, comes twice, or comes up to `by` seconds later, overtaken by others; of an answer:
-    that it is the one before it on the same key."""
+    """Probabilities that a message is lost, arrives twice, or arrives up to `by` seconds late so that others overtake
+    it; `old`: that an answer repeats the previous answer on its key."""
 
     lost: float = 0.0
     twice: float = 0.0
@@ -44,19 +44,19 @@ class End(Protocol):
     frozen: bool
     gone: bool
     after: tuple[str, Callable[[Any], None]] | None
-    """A kind of message or an operation, and what is called once one of it, or an answer to it, was sent: with the
-    session to which."""
+    """A kind of message or operation, and a callback: called once with the receiving session, after such a message or
+    an answer to it was sent."""
 
     def call(self, f: Callable[..., None], *args: Any) -> None:
-        """Calls `f` as code of its process."""
+        """Call `f` as code of its process."""
 
     def disconnected(self, peer: Any) -> None:
-        """There is no link to that one any more."""
+        """Handle the loss of the link to `peer`."""
 
 
 class MemoryLink:
-    """One direction between two processes: what is sent arrives in order, or, with probability `loss`, not at
-    all; after `delay` seconds and up to `jitter` more."""
+    """One direction between two processes. A message takes `delay` seconds and up to `jitter` more; it is lost with
+    probability `loss`."""
 
     def __init__(self, source: End, target: End, delay: float, chances: random.Random, trace: Trace | None) -> None:
         self.loop = source.loop
@@ -64,18 +64,18 @@ class MemoryLink:
         self.delay, self.jitter, self.loss = delay, 0.0, 0.0
         self.cut = False
         self.lost = False
-        """Whether it was blocked for longer than the lease: there is no link then."""
+        """True after it was blocked for longer than the lease, until it is connected again."""
         self.disturbed: Mapping[str, Disturbance] = {}
-        """By kind of message, see `kind_of`."""
+        """By kind of message (`kind_of`)."""
         self.hidden: set[object] = set()
-        """What the source has declared and the target does not know."""
+        """Declarations of the source that the target does not know."""
         self.answers: dict[str, bytes] = {}
-        """The last answer on each key, while answers are disturbed."""
+        """Last answer on each key, while answers are disturbed."""
         self.expiry: asyncio.TimerHandle | None = None
         self.relinking: asyncio.TimerHandle | None = None
         self.queue: list[tuple[float, int, Callable[..., None], tuple[Any, ...]]] = []
         self._last = 0.0
-        """When what was sent last is due: what comes in order comes no sooner."""
+        """Arrival time of the last message in order: later ones arrive no sooner."""
         self._numbers = itertools.count()
         self._random, self.trace = chances, trace
         self._timer: asyncio.TimerHandle | None = None
@@ -91,8 +91,9 @@ class MemoryLink:
         return probability > 0 and self._random.random() < probability
 
     def send(self, call: Callable[..., None], *args: Any, last: bool = False, late: float | None = None) -> None:
-        """`late`: so many seconds later than others, which may overtake it."""
-        if self.loop.is_closed():  # what is garbage then undeclares itself
+        """Deliver `call(*args)` at the target. `late`: seconds of additional delay, in which others may overtake it.
+        `last`: send it even over a lost link."""
+        if self.loop.is_closed():  # garbage collection undeclares tokens even then
             return
         if self.source is self.target:
             call(*args)
@@ -106,7 +107,7 @@ class MemoryLink:
             self.pump()
 
     def send_message(self, kind: str, call: Callable[..., None], *args: Any, operation: str = "") -> bool:
-        """Like `send`, of what may be disturbed: whether it did not get lost."""
+        """Send a message that may be disturbed. Return False if it was lost."""
         after = self.source.after
         if after is not None and after[0] in (kind, operation) and self.source is not self.target:
             self.source.after = None
@@ -123,15 +124,16 @@ class MemoryLink:
             self.send(call, *args, late=self._random.random() * fate.by if self.chance(fate.late) else None)
         return True
 
-    def lose_the_last(self, sent: int | None = None) -> None:
-        """Of what is under way, `sent` have left the source, or some. That it is gone was not said by itself."""
+    def lose_unsent(self, sent: int | None = None) -> None:
+        """Keep the first `sent` messages under way (None: a random number) and the notice that the source is gone,
+        which the network sends."""
         if self.queue:
             queue = sorted(self.queue)
             sent = self._random.randint(0, len(queue)) if sent is None else sent
-            self.queue = queue[:sent] + [one for one in queue[sent:] if one[2] == self.target.disconnected]
+            self.queue = queue[:sent] + [entry for entry in queue[sent:] if entry[2] == self.target.disconnected]
 
     def pump(self) -> None:
-        """Delivers what is due, and calls itself when more is."""
+        """Deliver due messages, and schedule itself for the next."""
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None
@@ -166,7 +168,7 @@ _decoder: Final = msgspec.json.Decoder(_Operation)
 
 
 def operation_of(payload: bytes | None) -> str:
-    """The operation that a query asks for, `hand_over` or the like; "" if there is none in it."""
+    """The operation of a query, such as `hand_over`; "" if it has none."""
     try:
         return _decoder.decode(payload or b"{}").op
     except (msgspec.MsgspecError, ValueError, RecursionError):

@@ -29,8 +29,8 @@ H = TypeVar("H")
 
 
 @lru_cache(1 << 16)
-def intersects(one: str, other: str) -> bool:
-    return one == other or zenoh.KeyExpr(one).intersects(zenoh.KeyExpr(other))
+def intersects(first: str, second: str) -> bool:
+    return first == second or zenoh.KeyExpr(first).intersects(zenoh.KeyExpr(second))
 
 
 MAX_KNOWN_KEYS: Final = 1_000
@@ -80,7 +80,7 @@ class MemoryNetwork:
         seed: int = 0,
         closed: bool = False,
     ) -> None:
-        self.closed = closed  # keys as with certificates; nobody is refused
+        self.closed = closed  # keys as with certificates, but no sender is refused
         self.delay, self.lease, self.impatience, self.relink = delay, lease, impatience, relink
         self.random = random.Random(seed)  # noqa: S311 - what failed once must fail again
         self.nodes: list[MemoryTransport] = []
@@ -128,7 +128,7 @@ class MemoryNetwork:
         self._changed()
 
     def disturb(self, disturbed: Mapping[str, Disturbance]) -> None:
-        """Disturb kinds of messages from now on, on all links but those of a session with itself."""
+        """Disturb messages by kind from now on, on all links between different sessions."""
         self._disturbed = disturbed
         for link in self.links.values():
             link.disturbed = {} if link.source is link.target else disturbed
@@ -170,7 +170,7 @@ class MemoryNetwork:
         for node in self._sessions(mesh):
             node.frozen = False
             if node.process is not None:
-                node.process.go_on()
+                node.process.resume()
         self._changed()
 
     def kill(self, mesh: Mesh, reached: MemoryTransport | None = None) -> None:
@@ -181,7 +181,7 @@ class MemoryNetwork:
         for node in self._sessions(mesh):
             for link in self.links.values():
                 if link.source is node and link.target is not reached:
-                    link.lose_the_last(None if reached is None else 0)
+                    link.lose_unsent(None if reached is None else 0)
             node.leave()
 
     def after_sending(self, mesh: Mesh, kind: str, then: Callable[[MemoryTransport], None] | None) -> None:
@@ -205,15 +205,15 @@ class MemoryNetwork:
             link = MemoryLink(source, target, self.delay, self.random, self.trace)
             if source is not target:
                 link.cut, link.disturbed = self._is_cut(str(source), str(target)), self._disturbed
-            if not (source.gone or target.gone):  # what arrives late may be of one that has gone
+            if not (source.gone or target.gone):  # a late message may involve a closed session
                 self.links[source, target] = link
         return link
 
     def linked(self, node: MemoryTransport) -> list[Neighbour]:
         """Return the sessions that `node` is linked to, itself included."""
         if (linked := self._linked.get(node)) is None:
-            everybody = [Neighbour(one, self.between(node, one), self.between(one, node)) for one in self.nodes]
-            linked = self._linked[node] = [one for one in everybody if not one.to.lost]
+            nodes = [Neighbour(other, self.between(node, other), self.between(other, node)) for other in self.nodes]
+            linked = self._linked[node] = [neighbour for neighbour in nodes if not neighbour.to.lost]
         return linked
 
     def match(self) -> None:
@@ -230,12 +230,12 @@ class MemoryNetwork:
         if link.lost and not (link.blocked or back.blocked):
             self._connect(source, target, forgetful)
 
-    def _connect(self, one: MemoryTransport, other: MemoryTransport, forgetful: float = 0.0) -> None:
+    def _connect(self, first: MemoryTransport, second: MemoryTransport, forgetful: float = 0.0) -> None:
         self._linked.clear()
-        for source, target in dict.fromkeys([(one, other), (other, one)]):
+        for source, target in dict.fromkeys([(first, second), (second, first)]):
             link = self.between(source, target)
             back, link.lost = link.lost, False
-            link.hidden = {one for one in source.declarations() if back and self.random.random() < forgetful}
+            link.hidden = {item for item in source.declarations() if back and self.random.random() < forgetful}
             for token in source.declared:
                 if token not in link.hidden:
                     link.send(target.on_token, source, token, True)
@@ -269,7 +269,7 @@ class MemoryNetwork:
             if link.expiry is not None:
                 link.expiry.cancel()
                 link.expiry = None
-            if link.target.frozen:  # what has reached it waits there, with the end of the link behind
+            if link.target.frozen:  # delivered messages wait there, then the end of the link
                 link.send(link.target.disconnected, link.source, last=True)
             else:
                 link.queue.clear()
@@ -348,10 +348,10 @@ class MemoryTransport(Transport):
             raise MeshError(f"{key} can't be asked: {error}") from None
         get = _Get(self, timeout, to)
         queries = [
-            (there, _Query(get, there.back, key, payload), one[1])
+            (there, _Query(get, there.back, key, payload), queryable[1])
             for there in self._linked()
-            for one in there.node.queryables.matching(key)
-            if one not in there.back.hidden
+            for queryable in there.node.queryables.matching(key)
+            if queryable not in there.back.hidden
         ]
         get.waiting = {query.id: there.node for there, query, _ in queries}
         get.check()
@@ -379,13 +379,13 @@ class MemoryTransport(Transport):
 
     def on_put(self, source: MemoryTransport, key: str, payload: bytes, attachment: bytes | None) -> None:
         hidden = self.network.between(self, source).hidden
-        for one in self.subscribers.matching(key):
-            if one not in hidden:
-                one[1](key, payload, attachment)
+        for subscriber in self.subscribers.matching(key):
+            if subscriber not in hidden:
+                subscriber[1](key, payload, attachment)
 
     def subscribes(self, key: str, to: MemoryLink) -> bool:
         """Return True if the process at the end of this link knows of a subscriber to `key` here."""
-        return any(one not in to.hidden for one in self.subscribers.matching(key))
+        return any(subscriber not in to.hidden for subscriber in self.subscribers.matching(key))
 
     def subscriber(self, key: str, on_sample: OnSample) -> Undeclare:
         remove = self.subscribers.add(key, on_sample)
@@ -412,7 +412,8 @@ class MemoryTransport(Transport):
         def undeclare() -> None:
             finalizer()
 
-        # Zenoh's, too, die with whoever should have kept them. What finalizes is kept for good: it must not hold this.
+        # As in Zenoh, a token dies with the declaration's last reference. The finalizer lives until then, so it must
+        # not refer to this session.
         finalizer = weakref.finalize(undeclare, _call, weakref.WeakMethod(self._undeclare_token), key)
         return undeclare
 
@@ -494,7 +495,7 @@ class MemoryPublisher(TransportPublisher):
 
 
 class _Get:
-    """A query of this process that is not over yet."""
+    """A running query of this process."""
 
     def __init__(self, node: MemoryTransport, timeout: float, to: Collector) -> None:
         self.node = node
@@ -569,7 +570,7 @@ class _Query(TransportQuery):
             self._back.send(get.end, self.id)
 
     __del__ = drop
-    """A handler that forgets a query drops it."""
+    """A handler that forgets its query drops it."""
 
 
 def _call(method: weakref.WeakMethod[Callable[[str], None]], argument: str) -> None:
@@ -585,12 +586,12 @@ class _Declared(Generic[H]):
         self._matching: dict[str, list[tuple[str, H]]] = {}
 
     def add(self, key: str, handler: H) -> Undeclare:
-        one = key, handler
-        self.all.append(one)
+        declared = key, handler
+        self.all.append(declared)
         self._matching = {}
 
         def remove() -> None:
-            self.all.remove(one)
+            self.all.remove(declared)
             self._matching = {}
 
         return remove
@@ -598,7 +599,7 @@ class _Declared(Generic[H]):
     def matching(self, key: str) -> list[tuple[str, H]]:
         """Return the handlers whose key expression intersects `key`; the list does not change."""
         if (found := self._matching.get(key)) is None:
-            if len(self._matching) >= MAX_KNOWN_KEYS:  # of programs that are gone, most of them
+            if len(self._matching) >= MAX_KNOWN_KEYS:  # most are keys of programs that have ended
                 self._matching.clear()
-            found = self._matching[key] = [one for one in self.all if intersects(one[0], key)]
+            found = self._matching[key] = [declared for declared in self.all if intersects(declared[0], key)]
         return found

@@ -1,10 +1,10 @@
-"""An asyncio event loop whose time jumps to the next timer when nothing is left to do, and processes on it.
+"""An asyncio event loop whose time jumps to the next timer when no callback is ready, and simulated processes on it.
 
-After trio's MockClock. For code that runs in one process without sockets and subprocesses, such as services on a mesh
-in memory: it waits for nothing, and runs in the same order every time.
+After trio's MockClock. For code without sockets and subprocesses, such as services on a mesh in memory: no real time
+passes, and every run has the same order.
 
-A `Process` represents a process of the operating system: tasks started in its context belong to it, with a clock and a
-source of randomness of its own. It can freeze, and die without running another line."""
+A `Process` represents a process of the operating system, with its own clock and random numbers; tasks started in its
+context belong to it. It can be frozen, or killed so that no further line of it runs."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ MANY_TIMERS: Final = 100
 """Number of timers above which cancelled ones are removed as soon as they are half of them."""
 
 START = 1_000.0
-"""The time at which a loop starts, in seconds: not zero, which often stands for "never"."""
+"""Time at which a loop starts, in seconds; not 0, which code may take for "never"."""
 
 PROCESS: Final[ContextVar[Process | None]] = ContextVar("PROCESS", default=None)
-"""The process whose code runs; None: the simulation itself, or there are no processes."""
+"""The process whose code runs; None: code outside all simulated processes."""
 
 
 class Deadlock(RuntimeError):
@@ -39,12 +39,12 @@ class Deadlock(RuntimeError):
 
 
 class Process:
-    """One process of a simulation. Its clock runs `rate` times as fast as virtual time, and began at `boot` seconds."""
+    """A simulated process. Its clock showed `boot` seconds at START and runs `rate` times as fast as virtual time."""
 
     def __init__(self, name: str, *, seed: object = 0, rate: float = 1.0, boot: float = 0.0) -> None:
         self.name, self.rate, self.boot = name, rate, boot
         self.stopped = False
-        """True while it is frozen: callbacks that fall due wait until `go_on`."""
+        """True while frozen: due callbacks wait until `resume`."""
         self.dead = False
         self.main: asyncio.Task[None] | None = None
         self._parked: list[asyncio.Handle] = []
@@ -55,7 +55,7 @@ class Process:
         self._context.run(RANDOM.set, random.Random(f"{seed} {name}"))  # noqa: S311 - what failed once must fail again
 
     def run(self, f: Callable[..., T], *args: Any) -> T:
-        """Calls `f` as code of this process."""
+        """Call `f` as code of this process."""
         return self._context.copy().run(f, *args)
 
     def local(self, time: float) -> float:
@@ -68,15 +68,15 @@ class Process:
     def stop(self) -> None:
         self.stopped = True
 
-    def go_on(self) -> None:
-        """Unfreeze: run the callbacks that fell due meanwhile, in their order."""
+    def resume(self) -> None:
+        """Unfreeze, and run the callbacks that became due meanwhile, in their order."""
         self.stopped = False
         parked, self._parked = self._parked, []
         for handle in parked:
             handle._loop._ready.append(handle)  # type: ignore[attr-defined]
 
     def kill(self) -> None:
-        """Kill it: none of its code runs any more, not even clean-up."""
+        """Kill the process: no more of its code runs, not even clean-up."""
         self.dead = True
         self._parked.clear()
         for _, task in sorted(self._tasks.items()):
@@ -90,7 +90,7 @@ class Process:
             loop.forget(self)
 
     def park(self, handle: asyncio.Handle) -> bool:
-        """Keeps what is due for later, or for never; False: it is to be done."""
+        """Return True if a due callback must not run: of a frozen process it is kept, of a killed process dropped."""
         if self.stopped and not self.dead:
             self._parked.append(handle)
         return self.stopped or self.dead
@@ -101,8 +101,8 @@ class Process:
 
 
 def _close(coro: Any) -> None:
-    # What it still did on its way out would touch nothing: its timers and tasks are dead, and so is its place on the
-    # mesh. What it raises is nobody's.
+    # Closing runs `finally` blocks; these affect nothing, since the timers, tasks and mesh session of a killed process
+    # are dead. Their errors are dropped.
     with suppress(BaseException):
         coro.close()
 
@@ -133,7 +133,8 @@ class VirtualTimeLoop(asyncio.SelectorEventLoop):
     _selector: selectors.BaseSelector
     _clock_resolution: float
     _scheduled: list[tuple[float, Any]]
-    """Not handles, as asyncio has it: pairs are compared without a line of Python, and in the same order."""
+    """Pairs instead of asyncio's handles: the interpreter compares them natively, which is faster, in the same
+    order."""
 
     def __init__(self) -> None:
         self._now = START
@@ -141,11 +142,11 @@ class VirtualTimeLoop(asyncio.SelectorEventLoop):
         super().__init__(_JumpingSelector(self))
         self._clock_resolution = 1e-9
         self.isolated = False
-        """Whether nothing outside can wake it, no thread and no file: it is not looked there."""
+        """True: no thread and no file wakes this loop, so it never polls for them."""
         self.set_task_factory(_begin)
 
     def time(self) -> float:
-        """By the clock of the process whose code asks."""
+        """Return the time by the clock of the calling process."""
         process = PROCESS.get()
         return self._now if process is None else process.local(self._now)
 
@@ -155,20 +156,21 @@ class VirtualTimeLoop(asyncio.SelectorEventLoop):
         return self._now
 
     def jump(self, seconds: float | None) -> bool:
-        """Lets time pass. Whether it did: not while a thread is at work, which takes real time."""
+        """Advance virtual time. Returns False, without advancing, while a thread works in real time. Raises Deadlock
+        for None."""
         if self._threads:
             return False
         if seconds is None:
-            raise Deadlock("no task can go on, and no timer is left that would wake one")
+            raise Deadlock("no task can continue, and no timer is left to wake one")
         self._now += seconds
         return True
 
     def _run_once(self) -> None:
-        """Like asyncio's own, in the same order; but nothing outside is looked at where nothing there can wake it."""
+        """As in asyncio and in its order, but without polling while the loop is isolated."""
         self._forget_cancelled()
         scheduled, ready = self._scheduled, self._ready
         if not self.isolated or not (ready or self._stopping or scheduled):
-            # What is overdue, as after a jump of its own, turns no clock back.
+            # An overdue timer, as after a direct `jump`, must not turn the clock back.
             left = max(0.0, scheduled[0][0] - self._now) if scheduled else None
             timeout = 0.0 if ready or self._stopping else left
             self._process_events(self._selector.select(timeout))
@@ -189,7 +191,7 @@ class VirtualTimeLoop(asyncio.SelectorEventLoop):
         if len(scheduled) > MANY_TIMERS and self._timer_cancelled_count > len(scheduled) / 2:
             for _, timer in scheduled:
                 timer._scheduled = not timer._cancelled
-            scheduled[:] = [one for one in scheduled if one[1]._scheduled]
+            scheduled[:] = [entry for entry in scheduled if entry[1]._scheduled]
             heapq.heapify(scheduled)
             self._timer_cancelled_count = 0
         while scheduled and scheduled[0][1]._cancelled:
@@ -198,10 +200,10 @@ class VirtualTimeLoop(asyncio.SelectorEventLoop):
             self._timer_cancelled_count -= 1
 
     def forget(self, process: Process) -> None:
-        """Timers of one that is dead, which would do nothing, keep their places, and nothing else of it."""
+        """Drop the callbacks of a killed process's timers, to free their memory. The timers keep their places."""
         for _, timer in self._scheduled:
             if timer._context.get(PROCESS) is process and not timer._cancelled:
-                timer._callback, timer._args = _nothing, ()
+                timer._callback, timer._args = _do_nothing, ()
 
     def call_at(  # type: ignore[override]  # like asyncio's own
         self, when: float, callback: Callable[..., object], *args: Any, context: Context | None = None
@@ -226,11 +228,11 @@ class VirtualTimeLoop(asyncio.SelectorEventLoop):
 
     def run_in_executor(self, executor: Any, func: Callable[..., T], *args: Any) -> asyncio.Future[T]:  # type: ignore[override]  # like asyncio's own
         if PROCESS.get() is not None:
-            # In a simulation threads take no time, and come in one order.
+            # In a simulation threads take no time and run in a fixed order.
             done: asyncio.Future[T] = self.create_future()
             try:
                 done.set_result(func(*args))
-            except Exception as error:  # noqa: BLE001 - it is raised to who awaits it
+            except Exception as error:  # noqa: BLE001 - raised where the future is awaited
                 done.set_exception(error)
             return done
         future = super().run_in_executor(executor, func, *args)
@@ -243,8 +245,8 @@ class VirtualTimeLoop(asyncio.SelectorEventLoop):
         await super().shutdown_default_executor(*args)
 
 
-def _nothing() -> None:
-    """What a dead process does."""
+def _do_nothing() -> None:
+    """Callback of a killed process's timers."""
 
 
 def _begin(loop: asyncio.AbstractEventLoop, coro: Any, **how: Any) -> asyncio.Task[Any]:
@@ -253,7 +255,7 @@ def _begin(loop: asyncio.AbstractEventLoop, coro: Any, **how: Any) -> asyncio.Ta
     process = PROCESS.get() if context is None else context.get(PROCESS)
     if process is not None:
         process.began(task)
-        if process.dead:  # begun by what cleans up after it
+        if process.dead:  # started by clean-up code of the killed process
             process.kill()
     return task
 
@@ -277,7 +279,7 @@ def run(coro: Coroutine[Any, Any, T]) -> T:
 
 
 def in_virtual_time(test: Callable[P, Coroutine[Any, Any, T]]) -> Callable[P, T]:
-    """Make an ordinary function of an async one, such as a test: each call runs it in virtual time."""
+    """Wrap an async function, such as a test, in an ordinary function that runs it in virtual time."""
 
     @functools.wraps(test)
     def call(*args: P.args, **kwargs: P.kwargs) -> T:
