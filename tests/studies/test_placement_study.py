@@ -83,7 +83,7 @@ def test_auto_finds_the_metric_that_foretells(decides: str, right: set[Metric]) 
 def test_auto_says_which_metric_it_believes_and_why() -> None:
     learner = MetricLearner()
     for number in range(ENOUGH):
-        assert learner.judge() == ("composite", f"the default: {number} placements seen, {ENOUGH} tell enough")
+        assert learner.judge() == ("composite", f"the default: {number} placements seen, {ENOUGH} are needed")
         scores = {metric: float(number if metric == "available_memory" else -number) for metric in CHOICES}
         learner.seen.append((scores, number / 10))
     metric, why = learner.judge()

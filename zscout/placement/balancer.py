@@ -135,9 +135,9 @@ class Balancer:
             there.discard(component)
             if not there:
                 del self._there[placement.host]
-            self._let_go(component, placement.host)
+            self._remove_pending(component, placement.host)
 
-    def _let_go(self, component: ComponentId, host: HostName) -> None:
+    def _remove_pending(self, component: ComponentId, host: HostName) -> None:
         waiting = self._pending.get(host, {})
         waiting.pop(component, None)
         if not waiting:
@@ -160,7 +160,7 @@ class Balancer:
             return
         placement.seen = True
         if now - placement.at >= SHOWN:
-            self._let_go(use.component, placement.host)
+            self._remove_pending(use.component, placement.host)
         if now - placement.at < SETTLED:
             return
         if len(self.profiles) < MAX_KINDS or placement.kind in self.profiles:

@@ -240,7 +240,7 @@ class Lifecycle:
             return host_gone(host)
         if record.unanswered >= MAX_PROBES and not record.token:
             self.surplus.add(record.component, record.incarnation, host)
-            return Termination("lost", f"its token is gone, and {host} tells nothing of it")
+            return Termination("lost", f"its token is gone, and {host} does not report it")
         record.unanswered += 1
         record.probed = True
         state.probe(record.component, host)
@@ -268,7 +268,7 @@ class Lifecycle:
         state.component_left(record)
         if end.cause in ("moved", "superseded") and not record.whereabouts_unknown:
             record.whereabouts_unknown = True
-            self._back_off(record, f"it went on elsewhere ({end.cause}), it is not known where", GRACE)
+            self._back_off(record, f"it moved to an unknown host ({end.cause})", GRACE)
             return
         cause = _cause(end, host)
         if end.bad_params:
@@ -341,7 +341,7 @@ class Lifecycle:
         match record.state:
             case "backing_off" if record.whereabouts_unknown:
                 record.whereabouts_unknown = False
-                self.ended(record, Termination("lost", "it went on elsewhere and was not heard of again"))
+                self.ended(record, Termination("lost", "it moved, and no host has reported it since"))
             case "waiting" | "backing_off":
                 self.place_again(record, record.restart_cause)
             case "starting":
@@ -369,7 +369,7 @@ def _cause(end: Termination, host: HostName) -> str:
         case "completed":
             return f"it completed on {host}" + (f": {end.reason}" if end.reason else "")
         case "failed":
-            return f"it failed on {host}: {end.reason or 'no reason was told'}"
+            return f"it failed on {host}: {end.reason or 'no reason given'}"
         case "stopped":
             return f"it was stopped on {host}, and not by the placer"
         case _:

@@ -194,7 +194,7 @@ class Migrations:
             case "ended", "standby" if move.tries > 1 or (move.termination and move.termination.with_host):
                 self._lose(record, move)
             case "running", "ended":
-                self._stay(record, move, "what stood by there has ended")
+                self._stay(record, move, "the standby there has ended")
             case _:
                 pass
 
@@ -210,7 +210,7 @@ class Migrations:
         elif move.source == "ended":
             self._lose(record, move)
         else:
-            self._stay(record, move, "nobody tells what came of it")
+            self._stay(record, move, "neither host reported the outcome")
 
     def _finish(self, record: ComponentRecord, move: Migration, dead: float | None = None) -> None:
         state, old, source, token = self.state, record.incarnation, record.host, record.token

@@ -195,7 +195,7 @@ class MetricLearner:
 
     def judge(self) -> tuple[Metric, str]:
         if len(self.seen) < ENOUGH:
-            return DEFAULT, f"the default: {len(self.seen)} placements seen, {ENOUGH} tell enough"
+            return DEFAULT, f"the default: {len(self.seen)} placements seen, {ENOUGH} are needed"
         ran = [rate for _, rate in self.seen]
         found = {metric: spearman([scores[metric] for scores, _ in self.seen], ran) for metric in CHOICES}
         best = max(CHOICES, key=lambda metric: found[metric] + AHEAD * (metric == DEFAULT))

@@ -198,7 +198,7 @@ class Reconciler:
             pass
         elif move is not None and incarnation == move.incarnation:
             record.ended_incarnations.append(incarnation)
-            self.migrations.target_ended(record, move, f"what stood by there has ended: {end.reason or end.cause}")
+            self.migrations.target_ended(record, move, f"the standby there has ended: {end.reason or end.cause}")
         elif incarnation != record.incarnation or record.superseded or record.state in OVER:
             pass
         elif move is not None:
@@ -220,7 +220,7 @@ class Reconciler:
             and not move.token
         ):
             state.mark_changed(record.component)
-            self.migrations.target_ended(record, move, "what stood by there is gone")
+            self.migrations.target_ended(record, move, "the standby there is gone")
         if record.host != host or (record.component, record.incarnation) in present:
             return
         asked = record.probed or listing.only is None
