@@ -106,7 +106,7 @@ def test_it_ends_by_itself_and_says_how_it_was(closet: Path, capfd: pytest.Captu
     assert sum(line.startswith("camera") and "http://127.0.0.1:" in line for line in said) == 4
     assert "scout35  id 35" in "\n".join(said)
     assert said[-1].startswith("2.")
-    assert "0 packets heard, 0 lost" in said[-1]
+    assert "0 packets received, 0 lost" in said[-1]
 
 
 @pytest.mark.live

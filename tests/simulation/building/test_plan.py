@@ -81,7 +81,7 @@ BAD = {
         "robot[0] (scout33): (2.6, 1.62) is in or touches a wall or furniture; leave 0.06 m around its middle"
     ),
     ("x = 1.0, y = 1.0", "x = 2.1, y = 1.0"): (
-        "robot[1] (scout35): stands in scout33; leave 0.12 m between their middles"
+        "robot[1] (scout35): overlaps scout33; leave 0.12 m between their middles"
     ),
     ("x = 1.0, y = 1.0", "x = 0.05, y = 1.0"): (
         "robot[0] (scout33): (0.05, 1) is in or touches a wall or furniture; leave 0.06 m around its middle"

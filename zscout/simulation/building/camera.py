@@ -216,7 +216,7 @@ class Camera:
         run[standing] = along + box * 1.7
 
     def _paint_moving(self, x: float, y: float, seen: Geometry, moving: list[Cylinder], picture: Floats) -> None:
-        """Shade each cylinder from the same side, whatever the light: it only has to look round."""
+        """Shade each cylinder from the same side in any light: the shading only makes it look round."""
         flat = seen.surface.ravel()
         pixels = np.flatnonzero(flat >= self.caster.first_moving)
         column, depth = pixels % WIDTH, seen.depth.ravel()[pixels]

@@ -151,4 +151,4 @@ def check_starts(plan: Plan, top: Where) -> None:
             )
         for other in plan.robots[:number]:
             if math.dist((robot.x, robot.y), (other.x, other.y)) < 2 * RADIUS:
-                raise where.bad(f"stands in {other.name}", f"leave {2 * RADIUS:g} m between their middles")
+                raise where.bad(f"overlaps {other.name}", f"leave {2 * RADIUS:g} m between their middles")

@@ -143,7 +143,7 @@ def _print(access: dict[str, Any]) -> None:
     if access["node"] is not None:
         terminal.print_line(f"node     {access['node']}: start it with zscout-node {access['node']}")
     if access["mesh"] is not None:
-        terminal.print_line(f"mesh     {access['mesh']} tells who is where")
+        terminal.print_line(f"mesh     positions on {access['mesh']}")
 
 
 def _line(served: Served, rate: float | None = None, cpu: float | None = None) -> str:
@@ -153,7 +153,7 @@ def _line(served: Served, rate: float | None = None, cpu: float | None = None) -
     words = (
         terminal.span(served.time),
         f"{served.frames} frames" if rate is None else f"speed {served.true_speed():.2f}  {rate:.0f} frames/s",
-        f"{radio.received} packets heard, {radio.lost} lost",
+        f"{radio.received} packets received, {radio.lost} lost",
         f"{radio.spoiled} spoiled" if radio.spoiled else "",
         f"{served.late} frames late" if served.late else "",
         f"{terminal.span(slipped)} behind: this machine is too busy" if slipped >= 0.05 else "",

@@ -228,7 +228,7 @@ class RobotsDemo(DemoRunner):
             seen.waits.append((now - self._waiting.pop(robot)) / SECOND)
             if robot == seen.taken and self._returned_at is not None and seen.resumed_after is None:
                 seen.resumed_after = (now - self._returned_at) / SECOND
-                self.event(f"{robot} goes on: {status.doing}")
+                self.event(f"{robot} continues: {status.doing}")
         if status.doing:
             seen.doing[robot] = status.doing
         (seen.watching.add if status.doing in WATCHING else seen.watching.discard)(robot)

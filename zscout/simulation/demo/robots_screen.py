@@ -88,7 +88,7 @@ def _takeover(seen: RobotsObserved) -> str:
     if seen.takeover is None:
         return "did not come to pass"
     words = f"{seen.taken} obeyed {1000 * seen.takeover:.0f} ms after the key"
-    return words + (f", went on {seen.resumed_after:.1f} s after" if seen.resumed_after is not None else "")
+    return words + (f", continued {seen.resumed_after:.1f} s after" if seen.resumed_after is not None else "")
 
 
 def _picture(demo: RobotsDemo, screen: DemoScreen) -> Group:

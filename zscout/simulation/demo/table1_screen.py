@@ -26,11 +26,7 @@ STYLES: Final = {
     "4": "white on #ff1463",
     "-": "bright_black",
 }  # the recording's colours, by ARC
-SOURCES: Final = {
-    "RCM": "what the leader published",
-    "ARCs": "what request bodies saw",
-    "paper": "Table 2 of the paper",
-}
+SOURCES: Final = {"RCM": "published by the leader", "ARCs": "seen by request bodies", "paper": "Table 2 of the paper"}
 LATE: Final = "all came in the order of the paper's Table 2, but late: this machine is busy"
 DIFFERENT: Final = "not in the order of the paper's Table 2"
 WIDE: Final = 26  # columns left of the first second
@@ -94,7 +90,7 @@ def _report(tables: dict[str, Table], wrong: list[Difference], seen: Observed, p
             terminal.print_line(f"differs: {item.rc} in second {item.second}: {words}")
     else:
         cells = sum(len(row) for row in tables["paper"].values())
-        terminal.print_line(f"All {cells} cells are those of the paper's Table 2 ({took:.0f} s).")
+        terminal.print_line(f"All {cells} cells agree with the paper's Table 2 ({took:.0f} s).")
 
 
 def _lines(tables: dict[str, Table], wrong: Set[tuple[str, int]] = frozenset()) -> Iterator[Text]:
