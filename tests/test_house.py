@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import ast
+import io
 import re
+import tokenize
 from collections import defaultdict
 from collections.abc import Iterator
 from pathlib import Path
@@ -21,6 +23,26 @@ WROTE = re.compile(r"`([\w./]+)`")
 TREES = {"zscout", "tests", "studies", "benchmarks", "examples"} | {path.parts[1] for path in MODULES}
 LIVE = re.compile(r"pytest\.mark\.live\b")
 LINK = re.compile(r"\]\(([^)#:]+)(?:#[^)]*)?\)")
+HEADLESS = (
+    r"(?:^|[.:;,(]\s+|\b(?:of|by|from|to|for|with|than|and|as|how|is) )(?:[Ww]ho|[Ww]hat)(?:ever)? (?:is|was|has|had|"
+    r"can|can't|may|asks?|holds?|waits?|comes?|goes|ends?|runs?|came|went|needs?|reads?|makes?|would|does|did|will|takes?|"
+    r"stands?|lives?|says?|leads?|joins?|changes|changed|follows|wants?|knows?|they|it|others|a|an|the|one|its|nobody|"
+    r"somebody)\b"
+)
+"""A clause without its noun: who holds it, what was asked."""
+PLAIN = ["zscout/placement", "zscout/simulation", "zscout/testing"]
+"""Folders and files in plain English: docstrings, comments and messages keep the rates of WORN."""
+WORN = {
+    HEADLESS: 1.0,
+    r"\b(?:told|tells?|telling|said|says|hears?|heard)\b": 1.0,
+    r"\b(?:[Nn]obody|[Ss]omebody|[Aa]nybody|[Ee]verybody|[Ww]hom|[Ww]hoever)\b": 0.5,
+    r"\b(?:(?:go|goes|going|gone|went) on|anew|mend(?:s|ed|ing)?|lately|likewise)\b": 0.5,
+    r"\bstands? (?:by|still|for|in|one|there|nowhere)\b": 0.5,
+    r"\b(?:is|are|was|were) to be\b|\bof what\b|\bthat of\b|\bthose (?:of|that|who)\b": 0.5,
+    r"\b(?:that|this|each|another|such a|which|no) one\b": 0.5,
+}
+"""Phrases that make a reader read twice, each with its most uses per 1,000 words."""
+ONE = re.compile(r"\bfor one in\b|\bone\.\w")
 
 
 def imports(tree: ast.Module) -> Iterator[str]:
@@ -96,3 +118,25 @@ def test_every_live_module_is_on_both_fleets_secured_or_says_why_not() -> None:
     secured, plain = len(SECURED), len(PLAIN_ONLY)
     counts = f"{len(live) - secured - plain} run on both, {secured} are about rights, {plain} on a plain fleet alone"
     assert counts in page
+
+
+def prose(source: str) -> Iterator[str]:
+    """Yield the lines of comments, docstrings and texts with a blank."""
+    for token in tokenize.generate_tokens(io.StringIO(source).readline):
+        if token.type == tokenize.COMMENT and not re.search("noqa|type:", token.string):
+            yield token.string.lstrip("# ")
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Constant) and isinstance(node.value, str) and " " in node.value:
+            yield from (line.strip() for line in node.value.splitlines())
+
+
+@pytest.mark.parametrize("room", PLAIN)
+def test_a_swept_room_is_in_plain_english(room: str) -> None:
+    path = ROOT / room
+    sources = [file.read_text() for file in ([path] if path.is_file() else sorted(path.rglob("*.py")))]
+    lines = [line for source in sources for line in prose(source)]
+    words = sum(len(line.split()) for line in lines)
+    for phrase, limit in WORN.items():
+        found = [line for line in lines for _ in re.findall(phrase, line)]
+        assert len(found) <= limit * words / 1000, found
+    assert [name for source in sources for name in ONE.findall(source)] == [], "name the variable by its noun"
