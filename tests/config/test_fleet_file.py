@@ -91,15 +91,15 @@ BAD_FLEETS_BY_TEXT = {
     f'[fleet]\nname = "{"x" * 65}"': f'fleet.name: "{"x" * 60}..." is not a name; {NAME_RULE}',
     f"[fleet]\ncandidates = {['a'] * 1001}": "fleet.candidates: has 1,001 entries; at most 1,000 are allowed",
     '[fleet]\npromise = "all"\npatience = 0': (
-        'fleet.promise: is "all", but only "adaptive" with some patience promises anything; '
+        'fleet.promise: is "all", but needs the strategy "adaptive" with some patience; '
         'write strategy = "adaptive" and a patience above 0, or promise = "equals"'
     ),
     '[fleet]\npromise = "all"\nstrategy = "optimal"': (
-        'fleet.promise: is "all", but only "adaptive" with some patience promises anything; '
+        'fleet.promise: is "all", but needs the strategy "adaptive" with some patience; '
         'write strategy = "adaptive" and a patience above 0, or promise = "equals"'
     ),
     '[fair_shares]\n[fleet]\nstrategy = "priority"': (
-        'fair_shares: is there, but only "adaptive" has an order of groups, not "priority"; '
+        'fair_shares: needs the strategy "adaptive", not "priority"; '
         'write strategy = "adaptive" under [fleet], or remove the table'
     ),
     '[roles]\nclient = ["bob"]\n[groups]\narms = ["bob"]\n[fair_shares.weights]\nbob = 2': (

@@ -23,7 +23,7 @@ BAD_NODES = {
     '[node]\nhots = "a"': "node.hots: unknown key; did you mean host?",
     '[node]\nhost = "a/b"': f'node.host: "a/b" is not a name; {NAME_RULE}',
     '[node]\nload = "yes"': 'node.load: is the text "yes"; write true, false or "tree"',
-    "[notify]": "notify: sends nothing to anybody; name urls or users, or remove the table",
+    "[notify]": "notify: has neither urls nor users; add either, or remove the table",
     '[node]\ncandidate = false\n[notify]\nurls = ["json://a"]': "notify: only the leader sends notices, "
     "and this host never leads; move it to a candidate",
     # No secret is shown.
@@ -83,7 +83,7 @@ def test_a_url_that_apprise_can_not_use_is_not_shown() -> None:
     with pytest.raises(BadInput) as caught:
         node('[notify]\nurls = ["none://user:secret@a"]')
     assert str(caught.value) == (
-        "node.toml: notify.urls[0]: is no URL that Apprise can use (not shown: it may hold a secret); "
+        "node.toml: notify.urls[0]: is not a URL that Apprise supports (not shown: it may hold a secret); "
         "https://appriseit.com shows the form for each service"
     )
 

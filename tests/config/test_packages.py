@@ -53,7 +53,7 @@ def test_what_is_missing_is_named_with_the_command_that_brings_it(module: str, r
     package = (MODULES | EXTRAS)[module.partition(".")[0]]
     said = how_to_get(ModuleNotFoundError(f"No module named {module!r}", name=module))
     command = f"{sys.executable} -m pip install {requirement}"
-    assert said == f"needs {package}, which is not installed here; {command} brings it"
+    assert said == f"needs {package}, which is not installed here; install it with {command}"
 
 
 def test_other_errors_are_left_as_they_are() -> None:

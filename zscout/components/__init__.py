@@ -1,1 +1,1 @@
-"""For authors of components: `zscout.components.component` has what one is written with."""
+"""For authors of components: import from `zscout.components.component`."""

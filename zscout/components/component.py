@@ -1,4 +1,4 @@
-"""What an author writes a component with; docs/components.md tells how."""
+"""Base class and context of components, for their authors; docs/components.md explains them."""
 
 from zscout.behaviors.components.component import Component, ComponentContext, Stage
 

@@ -1,7 +1,7 @@
-"""Who may do what in a fleet: the roles, groups, quotas and ceilings of a fleet file, and what they come to.
+"""Access rights: the roles, groups, quotas and ceilings of a fleet file, and the rights that follow for each name.
 
-A name is what a certificate says: a machine's (node, manager, relay) or a person's (viewer, client, operator). Without
-`[security]` nothing proves a name, so all of this is advice that nobody enforces."""
+A name is the common name of a certificate: a machine's (node, manager, relay) or a person's (viewer, client, operator).
+Without `[security]` names are not proved, and rights are not enforced."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ from zscout.types import SECOND, HostName, Ns, RcName
 MAX_NAMES: Final = 1_000
 """Names of one role or group; groups, patterns and quotas of one file."""
 MAX_PATTERNS: Final = 1_000
-"""RCs, or patterns of them, that one host may serve."""
-MAX_TOLD: Final = 4
-"""Names that a refusal lists of those who could."""
+"""RCs, or patterns of RCs, that a host may serve."""
+MAX_NAMED: Final = 4
+"""Permitted names that a refusal lists."""
 CLIENT_RUNTIME: Final[Ns] = 86_400 * SECOND
 """The longest minimum runtime of a client, by default."""
 _RC: Final = re.compile(r"[A-Za-z0-9_.*-]{1,64}/[A-Za-z0-9_.*-]{1,64}")
@@ -33,7 +33,7 @@ Patterns = Annotated[tuple[str, ...], Meta(max_length=MAX_PATTERNS)]
 
 
 class Roles(Struct, frozen=True, forbid_unknown_fields=True):
-    """The table [roles]: what each name may do. A person has one role; a machine may be node and manager."""
+    """The table [roles]: the role of each name. A person has one role; a machine may be node and manager."""
 
     viewer: Annotated[Names, key("People who may look.", example=["wall"])] = ()
     client: Annotated[Names, key("People whose programs may hold RCs, and start components.", example=["bob"])] = ()
@@ -49,22 +49,24 @@ class Roles(Struct, frozen=True, forbid_unknown_fields=True):
         ),
     ] = {}
     manager: Annotated[Names, key("Hosts whose nodes may lead; the others never do.", example=["anvil"])] = ()
-    relay: Annotated[Names, key("Hosts that join sites. What others send comes in their name.", example=["gate"])] = ()
+    relay: Annotated[
+        Names, key("Hosts that join sites. They forward all messages under their own name.", example=["gate"])
+    ] = ()
 
 
 class Quota(Struct, frozen=True, forbid_unknown_fields=True):
-    """A table of [quotas]: what one name, or the members of one group together, may have at one time."""
+    """A table of [quotas]: limits of one name, or of the members of one group together, at one time."""
 
     rcs: Annotated[Annotated[int, Meta(ge=0, le=100_000)] | None, key("RCs that are held.")] = None
     arcs: Annotated[Annotated[int, Meta(ge=0, le=100_000)] | None, key("ARCs, waiting or running.")] = None
 
 
 class Ceiling(Struct, frozen=True, forbid_unknown_fields=True):
-    """A table of [ceilings]: what ARCs of one role may ask for."""
+    """A table of [ceilings]: limits of each ARC of one role."""
 
     priority: Annotated[
         Annotated[int, Meta(ge=-1_000_000, le=1_000_000)] | None,
-        key("The highest; for clients it is below `operator_priority` in any case."),
+        key("The highest priority; for clients always below `operator_priority`."),
     ] = None
     runtime: Annotated[
         Ns | None, seconds("0", "31622400", "The longest minimum runtime; 0: any. Without it: a day for clients.")
@@ -77,13 +79,13 @@ class AccessPolicy(Struct, frozen=True, dict=True):
     roles: Roles = Roles()
     groups: Mapping[str, tuple[str, ...]] = {}
     access: Mapping[str, tuple[str, ...]] = {}
-    """By pattern of RCs: the names and groups that may hold them. Of several patterns each must allow it."""
+    """By pattern of RCs: the names and groups that may hold them. Each pattern that matches an RC must allow a name."""
     quotas: Mapping[str, Quota] = {}
     ceilings: Mapping[Rank, Ceiling] = {}
 
     @cached_property
     def ranks(self) -> Mapping[str, frozenset[Rank]]:
-        """Of every name that has any."""
+        """The ranks of each name that has some."""
         found: dict[str, set[Rank]] = {}
         for rank in get_args(Rank):
             for name in getattr(self.roles, rank):
@@ -92,7 +94,7 @@ class AccessPolicy(Struct, frozen=True, dict=True):
 
     @cached_property
     def digest(self) -> str:
-        """Equal where the rights are, in whatever order the names stand."""
+        """Hash of all rights, independent of the order of names."""
         return blake2b(_ordered(to_builtins(self)).encode(), digest_size=6).hexdigest()
 
     def ranks_of(self, name: str) -> frozenset[Rank]:
@@ -109,39 +111,40 @@ class AccessPolicy(Struct, frozen=True, dict=True):
         return [group for group, members in self.groups.items() if name in members]
 
     def holders(self, rc: RcName) -> frozenset[str] | None:
-        """The names that may hold this RC; None: all who may hold any."""
+        """The names that may hold this RC; None: all names that may hold any RC."""
         allowed: frozenset[str] | None = None
         for pattern, names in self.access.items():
             if matcher(as_pattern(pattern))(rc):
-                these = frozenset(one for name in names for one in self.groups.get(name, (name,)))
+                these = frozenset(member for name in names for member in self.groups.get(name, (name,)))
                 allowed = these if allowed is None else allowed & these
         return allowed
 
     def quotas_of(self, name: str) -> Iterator[tuple[str, Collection[str], Quota]]:
-        """What bounds this name: whose quota it is, the names whose ARCs count, and the quota."""
+        """The quotas that apply to this name: the name or group that has the quota, the names that share it, and the
+        quota."""
         for owner in (name, *self.groups_of(name)):
             if owner in self.quotas:
                 yield owner, self.groups.get(owner, (owner,)), self.quotas[owner]
 
     def ceiling(self, name: str) -> Ceiling:
-        """What an ARC of this name may ask for. Programs on a machine (its components) may what a client may."""
+        """The ceiling of this name's ARCs. Programs on a machine (its components) have the ceiling of clients."""
         ranks = self.ranks_of(name)
         rank: Rank = "operator" if "operator" in ranks else "client"
         found = self.ceilings.get(rank, Ceiling())
         return found if found.runtime is not None else replace(found, runtime=CLIENT_RUNTIME if rank == "client" else 0)
 
     def refusal(self, name: str, what: str, needed: Collection[Rank]) -> str:
-        """Why this name may not do `what`, which takes one of these ranks: who could. Empty: it may."""
+        """The text of `refusal_text` unless this name has one of the ranks `needed` for `what`; else ""."""
         if self.ranks_of(name) & {*needed}:
             return ""
-        return self.told(name, what, [one for one, ranks in self.ranks.items() if ranks & {*needed}])
+        return self.refusal_text(name, what, [other for other, ranks in self.ranks.items() if ranks & {*needed}])
 
-    def told(self, name: str, what: str, could: Collection[str]) -> str:
-        """That `name` may not do `what`, and who could."""
-        ranks, names = self.ranks_of(name), sorted(could)
+    def refusal_text(self, name: str, what: str, permitted: Collection[str]) -> str:
+        """`name` may not do `what`, and which names may."""
+        ranks, names = self.ranks_of(name), sorted(permitted)
         title = f"{name} ({', '.join(sorted(ranks))})" if ranks else f"{name}, which has no role here,"
-        more = f" and {len(names) - MAX_TOLD} more" if len(names) > MAX_TOLD else ""
-        return f"{title} may not {what}; {', '.join(names[:MAX_TOLD]) + more or 'nobody'} may"
+        more = f" and {len(names) - MAX_NAMED} more" if len(names) > MAX_NAMED else ""
+        return f"{title} may not {what}; {', '.join(names[:MAX_NAMED]) + more or 'nobody'} may"
 
 
 def _ordered(value: Any) -> str:
@@ -155,7 +158,7 @@ def _ordered(value: Any) -> str:
 
 
 def check_access(policy: AccessPolicy, at: Where) -> None:
-    """Refuses names in two roles, and groups and quotas of nobody. Raises BadInput."""
+    """Raises BadInput for a name with two roles, and for a group, access rule or quota with an unknown name."""
     seen: dict[str, Rank] = {}
     for rank in get_args(Rank):
         names, here = getattr(policy.roles, rank), at / "roles" / rank

@@ -1,5 +1,5 @@
-"""Apprise, in a process of its own that ends with its work: it loads all the services that it knows, which takes 28 MB,
-and what it logs may show a URL, which nobody hears there. URLs go in by its standard input."""
+"""Runs Apprise in a short-lived process: its services take 28 MB, and its log may show URLs, which are secret; the log
+of this process is dropped. URLs are passed through standard input."""
 
 from __future__ import annotations
 
@@ -13,25 +13,25 @@ from typing import Any, Final
 
 PROCESS: Final = (sys.executable, "-P", "-m", "zscout.config.apprise_process")
 TIMEOUT: Final = 60.0
-"""Seconds from its start to its end. Apprise takes 4 s to connect and 4 s for each answer at most, where the URL does
-not say otherwise (`cto`, `rto`)."""
+"""Seconds for the whole process. By default Apprise takes at most 4 s to connect and 4 s for each answer; a URL can set
+other limits (`cto`, `rto`)."""
 
 
 class NoAnswer(Exception):
-    """The process told nothing; the message says why, without a URL."""
+    """The process gave no result. The message has the reason, without a URL."""
 
 
 def usable(urls: Sequence[str]) -> list[bool]:
-    """Which of these URLs Apprise can use. Raises NoAnswer."""
-    return _asked({"urls": urls})
+    """For each URL, True if Apprise can use it. Raises NoAnswer."""
+    return _ask({"urls": urls})
 
 
-def sent(url: str, title: str, body: str) -> bool:
-    """Whether the service behind it has taken this text. Raises NoAnswer."""
-    return _asked({"urls": [url], "title": title, "body": body}) == [True]
+def send(url: str, title: str, body: str) -> bool:
+    """Send a text. Returns True if the service at `url` accepted it. Raises NoAnswer."""
+    return _ask({"urls": [url], "title": title, "body": body}) == [True]
 
 
-def _asked(question: Mapping[str, object]) -> list[bool]:
+def _ask(question: Mapping[str, object]) -> list[bool]:
     text = json.dumps(question).encode()
     try:
         done = subprocess.run(  # noqa: S603 - a program of ours
@@ -39,7 +39,7 @@ def _asked(question: Mapping[str, object]) -> list[bool]:
         )
         answer: list[bool] = json.loads(done.stdout)
     except subprocess.TimeoutExpired:
-        raise NoAnswer(f"Apprise has not ended within {TIMEOUT:g} s") from None
+        raise NoAnswer(f"Apprise did not end within {TIMEOUT:g} s") from None
     except (OSError, subprocess.CalledProcessError, ValueError) as error:
         raise NoAnswer(f"Apprise failed: {type(error).__name__}") from None
     return answer
@@ -56,7 +56,7 @@ def _answer(question: Mapping[str, Any]) -> list[bool]:
 
 
 if __name__ == "__main__":
-    os.nice(10)  # there is no hurry
+    os.nice(10)  # not urgent
     with redirect_stdout(sys.stderr):
         answer = _answer(json.load(sys.stdin))
     json.dump(answer, sys.stdout)

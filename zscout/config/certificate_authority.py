@@ -1,7 +1,7 @@
-"""A fleet's own CA, a folder with `ca.pem` and `ca-key.pem`: it issues certificates and renews them.
+"""A fleet's CA, a folder with `ca.pem` and `ca-key.pem`: it issues and renews certificates.
 
-What it issues is for both ends of a link, on the curve P-256, which every TLS library has. Needs the package
-`cryptography` (extra `secure`), on the machine of the CA alone."""
+Its certificates serve both ends of a link, on the curve P-256, which every TLS library supports. Only the machine of
+the CA needs the package `cryptography` (extra `secure`)."""
 
 from __future__ import annotations
 
@@ -42,25 +42,25 @@ from zscout.config.state_folder import write_durably
 from zscout.config.strict import Where, check_name, read_text
 
 PUBLIC, PRIVATE = 0o644, 0o600
-BEFORE: Final = timedelta(hours=1)
-"""How long ago a new certificate begins, for hosts whose clocks are late."""
+BACKDATED: Final = timedelta(hours=1)
+"""A new certificate is valid from this long ago, for hosts with slow clocks."""
 
 
 @dataclass(frozen=True, slots=True)
 class CertificateAuthority:
-    """One that can issue. Where a file can't be written, its methods raise OSError."""
+    """A CA with its private key. Methods that write raise OSError if a file can't be written."""
 
     folder: Path
     _certificate: x509.Certificate
     _key: ec.EllipticCurvePrivateKey
     _trusted: bytes
-    """All of `ca.pem`, which may hold other CAs beside this one: what those trust whom it issues a certificate."""
+    """Content of `ca.pem`, which may hold further CAs; it is copied beside each issued certificate."""
 
     @classmethod
     def make(cls, folder: Path, lasts: timedelta, now: datetime) -> Validity:
-        """A new one in this folder, in place of one that was there."""
+        """Make a CA in this folder, replacing an earlier CA."""
         key = _new_key()
-        # A name of its own, by which people and programs tell it from the next one.
+        # Each CA has a different name, so that an error can say which CA it means.
         number = x509.SubjectKeyIdentifier.from_public_key(key.public_key()).digest[:4].hex()
         name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, f"zscout CA {number}")])
         ends = _whole(now + lasts)
@@ -77,7 +77,7 @@ class CertificateAuthority:
 
     @classmethod
     def read(cls, folder: Path, now: datetime) -> Self:
-        """That in this folder. Raises BadInput where it is not whole, open to others or expired."""
+        """The CA in this folder. Raises BadInput if it is incomplete, expired, or its key is readable by others."""
         where, key_where = Where(str(folder / CA)), Where(str(folder / CA_KEY))
         if not (folder / CA_KEY).exists():
             raise key_where.bad("there is no such file", "make a CA with `zscout cert ca`, or name its folder by --ca")
@@ -90,7 +90,7 @@ class CertificateAuthority:
         if not isinstance(key, ec.EllipticCurvePrivateKey):
             raise key_where.bad("is not an elliptic-curve key", "make a CA with `zscout cert ca`")
         public = _public(key.public_key())
-        own = next((one for one in _parsed(trusted, where) if _public(one.public_key()) == public), None)
+        own = next((ca for ca in _parsed(trusted, where) if _public(ca.public_key()) == public), None)
         if own is None:
             raise key_where.bad(f"does not match any certificate in {CA}", _COPY)
         if now >= own.not_valid_after_utc:
@@ -98,8 +98,8 @@ class CertificateAuthority:
         return cls(folder, own, key, trusted)
 
     def issue(self, name: str, folder: Path, lasts: timedelta, now: datetime, *, manager: bool = False) -> datetime:
-        """Makes the folder of who has this name, in place of what was there; returns when its certificate ends: not
-        after this CA. A manager's has the key of places as well. Raises BadInput."""
+        """Write the folder of this name's certificate, replacing its files; a manager's folder also gets the key that
+        seals places. Returns the end of the certificate, at the latest that of this CA. Raises BadInput."""
         check_name(name, Where("NAME"))
         if manager:
             if (places := read_places_key(self.folder)) is None:
@@ -110,13 +110,13 @@ class CertificateAuthority:
         return self._write(folder, name, lasts, now, _new_key())
 
     def renew(self, folder: Path, lasts: timedelta, now: datetime, *, new_key: bool = False) -> datetime:
-        """Gives the certificate in this folder, expired or not, a later end, in place; its key, which need not be
-        there, stays unless `new_key`. Raises BadInput where no CA in this one's `ca.pem` has issued it."""
+        """Renew the certificate in this folder, expired or not, in place. It keeps its key, which need not be there,
+        unless `new_key`. Returns the new end. Raises BadInput if no CA in this CA's `ca.pem` issued it."""
         where = Where(str(folder / CERT))
         old = _parsed(read_text(folder / CERT, max_bytes=MAX_FILE).encode(), where)[0]
         if not any(_has_issued(ca, old) for ca in _parsed(self._trusted, Where(str(self.folder / CA)))):
             raise where.bad(f"was not issued by a CA in {self.folder / CA}", "name its CA by --ca, or issue it again")
-        name = ", ".join(str(one.value) for one in old.subject.get_attributes_for_oid(NameOID.COMMON_NAME))
+        name = ", ".join(str(part.value) for part in old.subject.get_attributes_for_oid(NameOID.COMMON_NAME))
         check_name(name, where)
         if new_key:
             return self._write(folder, name, lasts, now, _new_key())
@@ -133,7 +133,7 @@ class CertificateAuthority:
         now: datetime,
         key: ec.EllipticCurvePrivateKey | ec.EllipticCurvePublicKey,
     ) -> datetime:
-        """One file after the other, each whole. Who reads between them may find no pair, and tries again."""
+        """Write each file atomically in turn. Readers retry, since they may see a new key with the old certificate."""
         public = key if isinstance(key, ec.EllipticCurvePublicKey) else key.public_key()
         ends = min(_whole(now + lasts), self._certificate.not_valid_after_utc)
         subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
@@ -143,7 +143,7 @@ class CertificateAuthority:
             .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
             .add_extension(_usage(signs=False), critical=True)
             .add_extension(x509.ExtendedKeyUsage(both), critical=False)
-            # For programs other than zscout's that dial a host by its name.
+            # For programs other than zscout that connect to a host by its name.
             .add_extension(x509.SubjectAlternativeName([x509.DNSName(name)]), critical=False)
             .sign(self._key, SHA256())
         )
@@ -164,9 +164,9 @@ def _parsed(text: bytes, where: Where) -> list[x509.Certificate]:
         raise where.bad("has no readable PEM certificate", "copy it again") from None
 
 
-def _has_issued(ca: x509.Certificate, one: x509.Certificate) -> bool:
+def _has_issued(ca: x509.Certificate, certificate: x509.Certificate) -> bool:
     try:
-        one.verify_directly_issued_by(ca)
+        certificate.verify_directly_issued_by(ca)
     except (ValueError, TypeError, InvalidSignature, UnsupportedAlgorithm):
         return False
     return True
@@ -185,7 +185,7 @@ def _public(key: CertificatePublicKeyTypes) -> bytes:
 
 
 def _whole(at: datetime) -> datetime:
-    """The next whole second: certificates have no others."""
+    """The next whole second: certificates have no fractions."""
     return at if at.microsecond == 0 else at.replace(microsecond=0) + timedelta(seconds=1)
 
 
@@ -203,7 +203,7 @@ def _builder(
         .issuer_name(issuer)
         .public_key(key)
         .serial_number(x509.random_serial_number())
-        .not_valid_before(now - BEFORE)
+        .not_valid_before(now - BACKDATED)
         .not_valid_after(ends)
         .add_extension(x509.SubjectKeyIdentifier.from_public_key(key), critical=False)
         .add_extension(x509.AuthorityKeyIdentifier.from_issuer_public_key(issuer_key), critical=False)
@@ -211,7 +211,7 @@ def _builder(
 
 
 def _usage(*, signs: bool) -> x509.KeyUsage:
-    """Signs certificates, or else handshakes."""
+    """`signs`: the key signs certificates; otherwise handshakes."""
     return x509.KeyUsage(
         digital_signature=not signs,
         key_cert_sign=signs,

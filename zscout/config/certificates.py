@@ -1,8 +1,8 @@
-"""The folder of a machine's or person's certificate: `ca.pem` (whom it trusts), `cert.pem` and `key.pem`.
+"""The folder of a machine's or person's certificate: `ca.pem` (trusted CAs), `cert.pem` and `key.pem`.
 
-It takes the standard library alone to read it, so that nodes and clients need no more. That has no public parser of
-certificates, but TLS: the certificate shakes hands with itself, in memory, as server and as client. Times are left out
-there and looked at here, so that what is expired can be told as such, and shown."""
+Nodes and clients read it with the standard library alone. That has no public parser of certificates, but TLS does the
+checks: the certificate does a handshake with itself in memory, as server and client. TLS ignores times there and they
+are checked here, so that an expired certificate is reported as expired and can be shown."""
 
 from __future__ import annotations
 
@@ -25,25 +25,25 @@ KEY: Final = "key.pem"
 CA_KEY: Final = "ca-key.pem"
 """In the folder of a CA, beside its `ca.pem`."""
 PLACES_KEY: Final = "places.key"
-"""In the folders of managers and of their CA: by what they seal places in the queue."""
+"""In the folders of managers and of their CA: the key that seals places in the queue."""
 PLACES_KEY_BYTES: Final = 32
 KEYS_VARIABLE: Final = "ZSCOUT_KEYS"
-"""Names a person's folder."""
+"""Environment variable with the path of a person's folder."""
 MAX_FILE: Final = 65_536
 """Bytes of each file."""
-SOON: Final = timedelta(days=14)
-"""Before an end from when on it is warned of; of a short life the last third."""
+WARN_BEFORE_END: Final = timedelta(days=14)
+"""Warnings begin this long before the end of a certificate, or in the last third of a shorter validity."""
 NO_CHECK_TIME: Final = 0x200000
 """OpenSSL's X509_V_FLAG_NO_CHECK_TIME, which `ssl` passes on and does not name."""
-ROUNDS: Final = 3
-"""Of a handshake in which each side speaks; TLS 1.3 takes two."""
+HANDSHAKE_ROUNDS: Final = 3
+"""In each, both sides send once; TLS 1.3 takes two."""
 UNKNOWN_ISSUER: Final = frozenset({2, 7, 18, 19, 20, 21})
 """OpenSSL's codes for a certificate that no known CA has signed."""
 
 
 @dataclass(frozen=True, slots=True)
 class Validity:
-    """Of whom a certificate is, and for which time."""
+    """Name and validity of a certificate."""
 
     name: str
     """The common name."""
@@ -51,23 +51,23 @@ class Validity:
     ends: datetime
 
     def ends_in(self, now: datetime) -> float:
-        """Seconds until its end; negative: since then."""
+        """Seconds until its end, negative after it."""
         return (self.ends - now).total_seconds()
 
     def soon(self, now: datetime) -> bool:
-        """Whether its end, not yet there, is near enough to be told."""
-        return timedelta(0) < self.ends - now <= min(SOON, (self.ends - self.begins) / 3)
+        """Return True if it is still valid, but its end is near enough for a warning."""
+        return timedelta(0) < self.ends - now <= min(WARN_BEFORE_END, (self.ends - self.begins) / 3)
 
 
 @dataclass(frozen=True, slots=True)
 class Certificates(Validity):
-    """What such a folder holds. It ends with its CA, if not before."""
+    """The content of a certificate's folder. Its end is that of the certificate or of its CA, the earlier."""
 
     folder: Path
     issuer: str
     """The common name of its CA."""
     trusted: tuple[str, ...]
-    """Those of all CAs in `ca.pem`."""
+    """The common names of all CAs in `ca.pem`."""
 
     @property
     def ca(self) -> Path:
@@ -82,7 +82,7 @@ class Certificates(Validity):
         return self.folder / KEY
 
     def check(self, now: datetime, name: str | None = None) -> None:
-        """That it can be used now, by who has this `name`. Raises BadInput."""
+        """Raises BadInput unless it is valid now and, if given, for this `name`."""
         where = Where(str(self.cert))
         if name is not None and self.name != name:
             raise where.bad(
@@ -95,15 +95,15 @@ class Certificates(Validity):
             raise where.bad(f"expired on {shown(self.ends)}", "renew it (zscout cert renew), or set this host's clock")
 
     def expires_soon(self, now: datetime) -> str:
-        """What to tell people while its end is near, until then; else empty."""
+        """The warning while its end is near, otherwise ""."""
         if not self.soon(now):
             return ""
         return f"{self.cert}: expires on {shown(self.ends)}; renew it (zscout cert renew)"
 
 
 def read_certificates(folder: Path) -> Certificates:
-    """What the folder holds, whether still valid or not. Raises BadInput where a file is missing, broken or open to
-    others, key and certificate are no pair, no CA in `ca.pem` has issued it, or its name is none of zscout's."""
+    """Read a certificate's folder; an expired certificate is no error. Raises BadInput if a file is missing, broken or
+    open to others, if key and certificate do not match, if no CA in `ca.pem` issued it, or if its name is invalid."""
     import ssl
 
     instead = f"or name your own folder by ${KEYS_VARIABLE}"
@@ -130,22 +130,22 @@ def read_certificates(folder: Path) -> Certificates:
     except OSError as error:
         raise key.bad(f"can't be read: {error.strerror}", "check its permissions") from None
     try:
-        told = _shake_hands(*sides, read_text(folder / CA, max_bytes=MAX_FILE))
+        parsed = _shake_hands(*sides, read_text(folder / CA, max_bytes=MAX_FILE))
     except ssl.SSLCertVerificationError as error:
         if error.verify_code in UNKNOWN_ISSUER:
-            known = ", ".join(one.name for one in cas)
+            known = ", ".join(ca.name for ca in cas)
             raise cert.bad(f"was not issued by a CA in {CA} ({known})", "copy both from one folder") from None
         raise cert.bad(f"can't be used for zscout: {error.verify_message}", _MAKE) from None
     except ssl.SSLError as error:
         raise cert.bad(f"can't be used: {error.reason or error}", _MAKE) from None
-    own, issuer = validity(told, cert), common_name(told["issuer"])
+    own, issuer = validity(parsed, cert), common_name(parsed["issuer"])
     check_name(own.name, cert)
-    last = max((one.ends for one in cas if one.name == issuer), default=own.ends)
-    return Certificates(own.name, own.begins, min(own.ends, last), folder, issuer, tuple(one.name for one in cas))
+    last = max((ca.ends for ca in cas if ca.name == issuer), default=own.ends)
+    return Certificates(own.name, own.begins, min(own.ends, last), folder, issuer, tuple(ca.name for ca in cas))
 
 
 def read_places_key(folder: Path) -> bytes | None:
-    """By what the managers of this fleet seal places; None: there is no such file. Raises BadInput."""
+    """The key that seals places in the queue; None without its file. Raises BadInput."""
     path = folder / PLACES_KEY
     if not path.exists():
         return None
@@ -157,23 +157,23 @@ def read_places_key(folder: Path) -> bytes | None:
 
 
 def read_cas(path: Path) -> list[Validity]:
-    """The CAs in a file. Raises BadInput, for a certificate of another kind as well: Zenoh would trust what its owner
-    signs."""
+    """The CAs in a file. Raises BadInput, also for a certificate that is not a CA's: Zenoh would trust certificates
+    signed with its key."""
     check_mode(path, 0o002, "644")
     store = _store(path)
     count = store.cert_store_stats()
     where = Where(str(path))
     if count["x509"] != count["x509_ca"]:
         raise where.bad("has a certificate that is not a CA's", f"copy {CA} from the folder of the CA")
-    return [validity(one, where) for one in store.get_ca_certs()]
+    return [validity(ca, where) for ca in store.get_ca_certs()]
 
 
 def check_mode(path: Path, forbidden: int, remedy: str) -> None:
-    """That a file's mode has none of these bits. Raises BadInput."""
+    """Raises BadInput if a file's mode has one of the `forbidden` bits; `remedy` is the mode for chmod."""
     try:
         mode = path.stat().st_mode & 0o777
     except OSError:
-        read_text(path, max_bytes=MAX_FILE)  # says why it can't be
+        read_text(path, max_bytes=MAX_FILE)  # raises BadInput with the reason
         raise
     if mode & forbidden:
         done = "read" if mode & forbidden & 0o044 else "written" if mode & forbidden & 0o022 else "used"
@@ -188,7 +188,7 @@ _MAKE: Final = "make it with `zscout cert issue`"
 
 
 def _store(path: Path) -> ssl.SSLContext:
-    """A context that trusts what stands in the file. Raises BadInput."""
+    """A context that trusts the certificates in the file. Raises BadInput."""
     import ssl
 
     text = read_text(path, max_bytes=MAX_FILE)
@@ -201,7 +201,8 @@ def _store(path: Path) -> ssl.SSLContext:
 
 
 def _shake_hands(client: ssl.SSLContext, server: ssl.SSLContext, trusted: str) -> dict[str, Any]:
-    """What the certificate of both says, which each has checked of the other. Raises SSLError."""
+    """Connect both sides in memory, each checking the other's certificate; return the parsed certificate. Raises
+    SSLError."""
     import ssl
 
     client.check_hostname = False
@@ -211,26 +212,26 @@ def _shake_hands(client: ssl.SSLContext, server: ssl.SSLContext, trusted: str) -
         side.verify_flags |= ssl.VerifyFlags(NO_CHECK_TIME)
     there, back = ssl.MemoryBIO(), ssl.MemoryBIO()
     ends = (client.wrap_bio(back, there), server.wrap_bio(there, back, server_side=True))
-    for _ in range(ROUNDS):
+    for _ in range(HANDSHAKE_ROUNDS):
         for end in ends:
             with suppress(ssl.SSLWantReadError):
                 end.do_handshake()
     return ends[1].getpeercert() or {}
 
 
-def validity(told: Mapping[str, Any], where: Where) -> Validity:
-    """What a certificate says that `ssl` has read. Raises BadInput."""
+def validity(parsed: Mapping[str, Any], where: Where) -> Validity:
+    """Name and validity of a certificate that `ssl` has parsed. Raises BadInput."""
     from ssl import cert_time_to_seconds
 
     try:
         begins, ends = (
-            datetime.fromtimestamp(cert_time_to_seconds(told[key]), UTC) for key in ("notBefore", "notAfter")
+            datetime.fromtimestamp(cert_time_to_seconds(parsed[key]), UTC) for key in ("notBefore", "notAfter")
         )
     except (KeyError, ValueError, OverflowError):
         raise where.bad("has unreadable times", _MAKE) from None
-    return Validity(common_name(told["subject"]), begins, ends)
+    return Validity(common_name(parsed["subject"]), begins, ends)
 
 
 def common_name(name: tuple[tuple[tuple[str, str], ...], ...]) -> str:
-    """All of them where there are several: a text that is no name."""
+    """The common name in a parsed subject; several are joined, which gives an invalid name."""
     return ", ".join(value for part in name for key, value in part if key == "commonName")

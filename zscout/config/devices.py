@@ -1,6 +1,6 @@
-"""The [[rc]] tables of a node file: one struct for each driver that comes with zscout, told apart by the key `driver`.
+"""The [[rc]] tables of a node file: a struct for each driver that comes with zscout, selected by the key `driver`.
 
-What other drivers may be told is known where they are loaded: `drivers/registry.py`."""
+Options of other drivers are checked when the driver is loaded (`drivers/registry.py`)."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from zscout.messages import MAX_REGION, MAX_REGIONS, MotionLimits
 from zscout.types import MAX_CHANNEL, MAX_ROBOT, SECOND, Ns
 
 MAX_CHANNELS: Final = 64
-"""Video RCs that one robot or framegrabber knows."""
+"""Video RCs of a robot or framegrabber."""
 MAX_SOURCE: Final = 1_000
 """Characters of a port or source."""
 MAX_PARAMETERS: Final = 64
 """Capacities of one RC."""
 MAX_WORDS: Final = 64
-"""Of one command."""
+"""Words of one command."""
 
 A_PORT: Final = 'port = "/dev/ttyUSB0"'
 AN_ID: Final = "that its packets carry, as in id = 33"
@@ -31,7 +31,7 @@ A_COMMAND: Final = 'safe = ["psu", "off"]'
 A_SOURCE: Final = 'source = "/dev/video0", or a table sources'
 
 MAX_CORNERS: Final = 100
-"""Of all regions of one framegrabber: each frame carries them."""
+"""Corners of all regions of one framegrabber: each frame carries them."""
 MAX_MIN_AREA: Final = 0.5
 MAX_MIN_DURATION: Final = 60
 A_REGION: Final = "two opposite corners of a rectangle or three or more of a polygon, as in 0,0,0.4,0.1"
@@ -41,33 +41,35 @@ _SHARE: Final = re.compile(r"[0-9]{1,3}(\.[0-9]{0,9})?|\.[0-9]{1,9}", re.ASCII)
 Words: TypeAlias = tuple[str, ...]
 """A program and its arguments; no shell reads them."""
 SETTLE: Final[Ns] = 5 * SECOND
-Activation: TypeAlias = Annotated[Ns, seconds("0", "3600", "From a grant until the device can be used.")]
+Activation: TypeAlias = Annotated[Ns, seconds("0", "3600", "Time from a grant until the device can be used.")]
 
 
 class AnyRc(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """What every RC that a node runs is told, whatever its driver."""
+    """Keys of every RC, with any driver."""
 
     name: Annotated[str, key("`kind/name`.", example="robot/scout33")]
     settle: Annotated[
-        Ns, seconds("0.5", "60", "A program that touches the device past its RC must end within, and a safe state.")
+        Ns,
+        seconds(
+            "0.5", "60", "Time for a direct program to end after its hold, and for the driver to reach safe state."
+        ),
     ] = SETTLE
     begin_within: Annotated[
         Ns | None,
-        seconds(
-            "0", "86400", "The longest time from a grant until the device is ready. Without it: what its driver says."
-        ),
+        seconds("0", "86400", "The longest time from a grant until the device is ready. Default: given by its driver."),
     ] = None
 
     tolerate: Annotated[
-        Ns | None, seconds("0", "86400", "A holder keeps it this long while it is not well. 60 for `command`, else 0.")
+        Ns | None,
+        seconds("0", "86400", "A holder keeps an unwell device this long. Default: 60 for `command`, else 0."),
     ] = None
-    tolerate_free: Annotated[Ns, seconds("0", "86400", "Free, it is unwell this long before it counts as lost.")] = 0
+    tolerate_free: Annotated[Ns, seconds("0", "86400", "A free device is unwell this long before it is lost.")] = 0
     tolerate_max: Annotated[
         Ns | None,
         seconds(
             "0",
             "86400",
-            "The longest outage that a holder may announce. Without it: 3600 for `command`, else as `tolerate`.",
+            "The longest outage that a holder may announce. Default: 3600 for `command`, else as `tolerate`.",
         ),
     ] = None
 
@@ -77,22 +79,22 @@ class RcTable(AnyRc, frozen=True, tag_field="driver"):
 
 
 class PluginRc(AnyRc, frozen=True):
-    """An RC whose driver is installed beside zscout, which alone knows what it may be told."""
+    """An RC whose driver is installed beside zscout; only the driver knows its options."""
 
     driver: str
     options: Mapping[str, Any]
-    """As they stand in the file, unchecked."""
+    """From the file, unchecked."""
     at: Where
 
 
 class ExclusiveRc(RcTable, frozen=True, tag="exclusive"):
-    """A device that one ARC holds at a time; it needs no driver of its own."""
+    """A device for a single ARC at a time, without a driver."""
 
     activation: Activation = 0
 
 
 class CapacityRc(RcTable, frozen=True, tag="capacity"):
-    """A device that several ARCs share within its capacity."""
+    """A device that several ARCs share within its capacity, without a driver."""
 
     capacity: Annotated[
         Mapping[str, Decimal],
@@ -107,42 +109,44 @@ class RadioRc(RcTable, frozen=True, tag="radio"):
     port: Annotated[
         str, key("For pyserial's `serial_for_url`.", example="/dev/ttyUSB0", remedy=f"add it, as in {A_PORT}")
     ]
-    baud: Annotated[int, key("Of the line.", 300, 1_000_000, unit="bit/s")] = 9_600
-    bound: Annotated[Ns, seconds("0.01", "10", "The longest that a packet may wait.")] = SECOND // 4
-    dtr: Annotated[bool | None, key("How DTR is from the opening on; a board may be reset by it.", example=False)] = (
-        None
-    )
-    rts: Annotated[bool | None, key("How RTS is from the opening on.", example=False)] = None
+    baud: Annotated[int, key("Rate of the line.", 300, 1_000_000, unit="bit/s")] = 9_600
+    bound: Annotated[Ns, seconds("0.01", "10", "The longest time that a packet may wait.")] = SECOND // 4
+    dtr: Annotated[bool | None, key("State of DTR while the port is open; it may reset a board.", example=False)] = None
+    rts: Annotated[bool | None, key("State of RTS while the port is open.", example=False)] = None
 
 
 class RobotRc(RcTable, frozen=True, tag="robot"):
     """A robot that is driven over a radio."""
 
-    id: Annotated[int, key("That its packets carry.", 0, MAX_ROBOT, example=33, remedy=f"add the id {AN_ID}")]
+    id: Annotated[int, key("Id in its packets.", 0, MAX_ROBOT, example=33, remedy=f"add the id {AN_ID}")]
     radio: Annotated[str, key("The RC that carries its halt.", example="radio/rf0", remedy=f"add the radio {A_RADIO}")]
     channels: Annotated[
         Mapping[str, Annotated[int, Meta(ge=1, le=MAX_CHANNEL)]],
-        key("Of its camera's transmitter, by video RC.", most=MAX_CHANNELS, example={"video/ch1": 1}),
+        key("Channels of its camera's transmitter, by video RC.", most=MAX_CHANNELS, example={"video/ch1": 1}),
     ] = {}
-    warm_up: Annotated[Ns, seconds("0", "60", "Of its camera, once it is switched on.")] = 2 * SECOND
-    dead_man: Annotated[Ns, seconds("0.05", "5", "Its wheels are stopped this long after the last drive command.")] = (
+    warm_up: Annotated[Ns, seconds("0", "60", "Warm-up time of its camera.")] = 2 * SECOND
+    dead_man: Annotated[Ns, seconds("0.05", "5", "The wheels stop this long after the last drive command.")] = (
         SECOND // 2
     )
 
 
 class CommandRc(RcTable, frozen=True, tag="command"):
-    """A device that is switched by commands of one's own, run on the node, as the node's user."""
+    """A device switched by the user's own commands, which run on the node as the node's user."""
 
-    start: Annotated[Words, key("When somebody begins to hold it.", example=["psu", "on"])] = ()
-    stop: Annotated[Words, key("When that ends.", example=["psu", "save"])] = ()
-    safe: Annotated[Words, key("When nobody holds it, and as the node begins and ends.", example=["psu", "off"])] = ()
-    health: Annotated[Words, key("Whether it works: exit code 0.", example=["psu", "ping"])] = ()
+    start: Annotated[Words, key("Command at the begin of a hold.", example=["psu", "on"])] = ()
+    stop: Annotated[Words, key("Command at the end of a hold.", example=["psu", "save"])] = ()
+    safe: Annotated[
+        Words, key("Command when the device becomes free, and when the node starts and ends.", example=["psu", "off"])
+    ] = ()
+    health: Annotated[
+        Words, key("Command that checks the device: exit code 0 if it works.", example=["psu", "ping"])
+    ] = ()
     parameters: Annotated[
         Mapping[str, Decimal],
-        key("The most that a holder may ask for of each.", most=MAX_PARAMETERS, example={"voltage": 30}),
+        key("Greatest value of each parameter of a request.", most=MAX_PARAMETERS, example={"voltage": 30}),
     ] = {}
-    every: Annotated[Ns, seconds("0.5", "3600", "From the end of one `health` to the next.")] = 10 * SECOND
-    timeout: Annotated[Ns, seconds("0.1", "600", "After which a command is killed, with all that it started.")] = (
+    every: Annotated[Ns, seconds("0.5", "3600", "Pause between two runs of `health`.")] = 10 * SECOND
+    timeout: Annotated[Ns, seconds("0.1", "600", "Time after which a command and its children are killed.")] = (
         5 * SECOND
     )
     activation: Activation = 0
@@ -153,37 +157,41 @@ class VideoRc(RcTable, frozen=True, tag="video"):
 
 
 class FramegrabberRc(RcTable, frozen=True, tag="framegrabber"):
-    """A receiver of frames. It has either one source, or one for each video RC."""
+    """A receiver of frames, with a single source or one for each video RC."""
 
-    source: Annotated[str | None, key("For OpenCV, whatever it shows.", example="/dev/video0")] = None
+    source: Annotated[str | None, key("OpenCV's name of the source.", example="/dev/video0")] = None
     sources: Annotated[
         Annotated[Mapping[str, str], Meta(max_length=MAX_CHANNELS)] | None,
-        key("For OpenCV, of each video RC.", example={"video/ch1": "/dev/video0"}),
+        key("OpenCV's name of the source of each video RC.", example={"video/ch1": "/dev/video0"}),
     ] = None
-    rate: Annotated[float, key("Published at most.", 0.1, 60, unit="frames/s")] = 10.0
-    quality: Annotated[int, key("Of the JPEG.", 1, 100)] = 80
-    picture_within: Annotated[Ns, seconds("0.5", "600", "From one picture of the source to the next at most.")] = (
+    rate: Annotated[float, key("Greatest rate of published frames.", 0.1, 60, unit="frames/s")] = 10.0
+    quality: Annotated[int, key("Quality of the JPEGs.", 1, 100)] = 80
+    picture_within: Annotated[Ns, seconds("0.5", "600", "The longest time between two pictures of the source.")] = (
         3 * SECOND // 2
     )
     still_after: Annotated[
         Ns | None,
-        seconds("0", "86400", "Of the same picture, to the bit: the source is frozen. 0: never. 10 but for files."),
+        seconds(
+            "0", "86400", "A source is frozen after this time of identical pictures; 0: never. Default: 10, files 0."
+        ),
     ] = None
-    transport: Annotated[Literal["tcp", "udp"], key("Of `rtsp://`; `udp` falls back to TCP.", example="udp")] = "tcp"
+    transport: Annotated[
+        Literal["tcp", "udp"], key("Transport of `rtsp://`; `udp` falls back to TCP.", example="udp")
+    ] = "tcp"
     ignore: Annotated[
         tuple[str, ...], key("Regions in which motion does not count.", most=MAX_REGIONS, example=["0,0,0.4,0.1"])
     ] = ()
-    min_area: Annotated[float, key("Least share of the picture in one moving thing.", 0, MAX_MIN_AREA)] = 0.0
+    min_area: Annotated[float, key("Least share of the picture that a moving object covers.", 0, MAX_MIN_AREA)] = 0.0
     min_duration: Annotated[Ns, seconds("0", str(MAX_MIN_DURATION), "Shorter motion is not reported.")] = 0
 
     @property
     def by_video(self) -> Mapping[str, str]:
-        """The source of each video RC; "" alone where one serves for all."""
+        """The source of each video RC; a single source has the key ""."""
         return {"": self.source} if self.source is not None else self.sources or {}
 
     @property
     def motion(self) -> MotionLimits | None:
-        """None without limits."""
+        """None if no limit differs from its default."""
         regions = [parse_region(text) for text in self.ignore]
         limits = MotionLimits(regions, self.min_area, self.min_duration / SECOND)
         return limits if limits != MotionLimits() else None
@@ -194,26 +202,26 @@ RcConfig: TypeAlias = BuiltInRc | PluginRc
 
 _BUILT_IN: Final[Any] = BuiltInRc
 BUILT_IN: Final = frozenset(str(rc.__struct_config__.tag) for rc in get_args(BuiltInRc))
-"""The names of the drivers that come with zscout."""
+"""Names of the drivers that come with zscout."""
 
 
 def read_rc(table: Mapping[str, Any], at: Where) -> RcConfig:
-    """An [[rc]] table, checked as far as can be without its driver. Raises BadInput."""
+    """Read an [[rc]] table and check it as far as possible without its driver. Raises BadInput."""
     driver = table.get("driver")
     if isinstance(driver, str) and driver not in BUILT_IN:
         common = {field.encode_name for field in structs.fields(AnyRc)}
-        told = convert({name: value for name, value in table.items() if name in common}, AnyRc, at)
+        keys = convert({name: value for name, value in table.items() if name in common}, AnyRc, at)
         options = {name: value for name, value in table.items() if name not in common | {"driver"}}
-        check_rc_name(told.name, at / "name")
+        check_rc_name(keys.name, at / "name")
         check_name(driver, at / "driver")
-        return PluginRc(**structs.asdict(told), driver=driver, options=options, at=at)
+        return PluginRc(**structs.asdict(keys), driver=driver, options=options, at=at)
     rc: BuiltInRc = convert(table, _BUILT_IN, at)
     _check_rc(rc, at)
     return rc
 
 
 def _check_rc(rc: BuiltInRc, at: Where) -> None:
-    """Refuses what no type can: names of another kind, sources that stand twice. Raises BadInput."""
+    """Checks beyond the types, such as names and duplicate channels. Raises BadInput."""
     check_rc_name(rc.name, at / "name")
     if isinstance(rc, RadioRc | RobotRc | VideoRc | FramegrabberRc):
         driver = str(rc.__struct_config__.tag)
@@ -285,7 +293,7 @@ def parse_region(text: str) -> list[float]:
 
 
 def check_regions(regions: Sequence[list[float]], at: Where) -> None:
-    """Refuses more than the head of a frame holds. Raises BadInput."""
+    """Raises BadInput for more regions than the head of a frame holds."""
     corners = sum(map(len, regions)) // 2
     if len(regions) > MAX_REGIONS or corners > MAX_CORNERS:
         what = f"has {len(regions)} regions with {corners} corners"

@@ -1,4 +1,4 @@
-"""The fleet file: what all hosts of one fleet have in common."""
+"""The fleet file: the settings that all hosts of a fleet share."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ from zscout.types import SECOND, Ns
 FLEET_VARIABLE: Final = "ZSCOUT_FLEET"
 """Environment variable with the path of the fleet file, for the CLI."""
 KEYS_VARIABLE: Final = "ZSCOUT_KEYS"
-"""Environment variable with the folder of this user's certificate, instead of the file's."""
+"""Environment variable with the folder of this user's certificate; overrides the file."""
 KEYS: Final = 'folder = "/etc/zscout/keys"'
 MAX_CANDIDATES: Final = 1_000
 MAX_ENDPOINTS: Final = 256
@@ -52,7 +52,7 @@ MIN_RUNTIME: Final[Ns] = 60 * SECOND
 DAY: Final[Ns] = 86_400 * SECOND
 MAX_HOSTS: Final = 1_000
 MAX_DEVICES: Final = 1_000
-"""That a fleet file expects of one host."""
+"""Devices of one host in a fleet file."""
 
 _ENDPOINT: Final = re.compile(
     r"(?P<protocol>[a-z]+)/(?P<host>\[[0-9A-Fa-f:.%]+\]|[A-Za-z0-9_.-]+):(?P<port>[0-9]{1,5})"
@@ -70,13 +70,13 @@ class MeshTable(Struct, frozen=True, forbid_unknown_fields=True):
     """The table [mesh]: how a host, and each program on it, joins the mesh."""
 
     listen: Annotated[Endpoints, key("Endpoints of this host; none: a free port.", example=["tcp/0.0.0.0:7447"])] = ()
-    connect: Annotated[Endpoints, key("Endpoints of hosts to be connected to always.", example=["tcp/anvil:7447"])] = ()
+    connect: Annotated[Endpoints, key("Endpoints of hosts to stay connected to.", example=["tcp/anvil:7447"])] = ()
     multicast: Annotated[bool, key("Whether hosts find each other by UDP multicast.")] = True
     multicast_address: Annotated[str, key("`ip:port`.")] = "224.0.0.224:7446"
     interface: Annotated[str, key("Network interfaces for multicast.", example="eth0")] = "auto"
-    lease: Annotated[float, key("A host that was silent for this long is gone.", 0.2, 30, unit="s")] = 1.0
+    lease: Annotated[float, key("A host counts as gone after this long a silence.", 0.2, 30, unit="s")] = 1.0
     site: Annotated[
-        str | None, key("The site of this host, where a relay joins several to one fleet.", example="north")
+        str | None, key("The site of this host, if a relay joins several sites to one fleet.", example="north")
     ] = None
 
 
@@ -84,21 +84,22 @@ class MeshConfig(MeshTable, frozen=True):
     """How one process joins the mesh."""
 
     relay: Sites = ()
-    """It joins these sites: a node's only, not that of a program on the same host."""
+    """The sites that this process joins; only nodes relay, not other programs of their hosts."""
     shared: tuple[str, ...] = ()
-    """Without multicast: the endpoints in the fleet file, where this host or process has others."""
+    """Without multicast: the endpoints of the fleet file, if this host or process has different ones."""
 
     @property
     def known_by(self) -> tuple[str, ...]:
-        """What all processes of a host know this mesh by; empty if there is nothing."""
+        """Addresses that identify this mesh to all processes of a host: the multicast address, or without it the
+        endpoints of the fleet file."""
         return (
             (self.multicast_address,) if self.multicast else self.shared or tuple(sorted({*self.listen, *self.connect}))
         )
 
 
 class SecurityTable(Struct, frozen=True, forbid_unknown_fields=True):
-    """The table [security]: only who has a certificate of the fleet's is let in. `ca.pem`, `cert.pem` and `key.pem` lie
-    in its folder; the certificate's name is the host's, or the person's. [roles] says what each may do."""
+    """The table [security]: the mesh admits only holders of the fleet's certificates. The folder has `ca.pem`,
+    `cert.pem` and `key.pem`; the certificate's name is that host or person. [roles] has the rights of each name."""
 
     folder: Annotated[
         str, key("The folder of the certificate, relative to this file; `~` is the home.", example="/etc/zscout/keys")
@@ -106,7 +107,7 @@ class SecurityTable(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class RcmLimits(Struct, frozen=True, forbid_unknown_fields=True):
-    """The table [limits]: what the RCM accepts at most."""
+    """The table [limits]: upper bounds that the RCM enforces."""
 
     max_queued: Annotated[int, key("ARCs that wait at one time.", 1, 1_000_000)] = 10_000
     max_needs: Annotated[int, key("RCs in one ARC.", 1, 1_000)] = 64
@@ -114,17 +115,17 @@ class RcmLimits(Struct, frozen=True, forbid_unknown_fields=True):
     max_requests_per_host: Annotated[
         int, key("ARCs of all clients of one host or person, waiting or running.", 1, 1_000_000)
     ] = 2_500
-    max_payload: Annotated[int, key("Of one request.", 1_024, 16_777_216, unit="bytes")] = 65_536
+    max_payload: Annotated[int, key("Size of one request.", 1_024, 16_777_216, unit="bytes")] = 65_536
     max_running_per_host: Annotated[
-        int, key("Running ARCs of all clients of one host, but for an operator's; 0: any number.", 0, 100_000)
+        int, key("Running ARCs of all clients of one host, except operators; 0: any number.", 0, 100_000)
     ] = 0
     max_runtime: Annotated[
-        Ns, seconds("0", "31622400", "After this long every hold ends as completed, whoever's it is; 0: never.")
+        Ns, seconds("0", "31622400", "After this long every hold ends as completed, also an operator's; 0: never.")
     ] = 0
     max_booking: Annotated[
         Ns, seconds("0", "31622400", "The longest booking, whose hold lasts until its end; 0: as `max_runtime`.")
     ] = 0
-    max_bookings_per_host: Annotated[int, key("Bookings of one host or person, that are not over.", 0, 1_000)] = 100
+    max_bookings_per_host: Annotated[int, key("Current and future bookings of one host or person.", 0, 1_000)] = 100
 
     def bound(self, policy: SchedulingPolicy) -> SchedulingPolicy:
         return dataclasses.replace(
@@ -136,39 +137,37 @@ class RcmLimits(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Timing(Struct, frozen=True, forbid_unknown_fields=True):
-    """The table [timing]: the clockwork of the RCM and of RCs, in ns. `hold_lease` is longer than the mesh lease plus
-    `rebuild`, and than two heartbeats."""
+    """The table [timing]: timing of the RCM and of RCs, in ns. `hold_lease` exceeds two heartbeats, and the mesh lease
+    plus `rebuild`."""
 
-    heartbeat: Annotated[Ns, seconds("0.05", "10", "From one publication of the RCM to the next at the latest.")] = (
+    heartbeat: Annotated[Ns, seconds("0.05", "10", "The longest time between two publications of the RCM.")] = (
         SECOND // 2
     )
     hold_lease: Annotated[
-        Ns, seconds("0.5", "300", "A hold ends at RC and client when no RCM was heard for this long.")
+        Ns, seconds("0.5", "300", "A hold ends at RC and client after this long without a publication of an RCM.")
     ] = 3 * SECOND
     vote_timeout: Annotated[Ns, seconds("0.01", "10", "A vote is overdue after this long.")] = SECOND // 4
-    rebuild: Annotated[Ns, seconds("0.01", "10", "A new RCM waits this long for what stands.")] = SECOND // 5
+    rebuild: Annotated[Ns, seconds("0.01", "10", "A new RCM waits this long for reports of present holds.")] = (
+        SECOND // 5
+    )
 
 
 class PlacementPolicy(Struct, frozen=True, forbid_unknown_fields=True):
-    """The table [placement]: how hard a fleet tries to place, and whether it moves what pays. Durations in ns."""
+    """The table [placement]: starts, restarts and moves of components. Durations in ns."""
 
     start_timeout: Annotated[Ns, seconds("0.05", "600", "A start without an answer for this long has failed.")] = (
         15 * SECOND
     )
-    restarts: Annotated[int, key("Starts in a row that fail soon until it is given up.", 0, 1_000)] = 5
-    back_off: Annotated[Ns, seconds("0.05", "3600", "Before the first restart after a failure; doubled each time.")] = (
-        SECOND // 2
-    )
-    longest_back_off: Annotated[Ns, seconds("0.05", "86400", "Up to this.")] = 30 * SECOND
-    settled: Annotated[Ns, seconds("0.05", "86400", "After running this long its failures are counted anew.")] = (
+    restarts: Annotated[int, key("Restarts in a row after early failures before it is given up.", 0, 1_000)] = 5
+    back_off: Annotated[Ns, seconds("0.05", "3600", "Pause before the first restart; doubled each time.")] = SECOND // 2
+    longest_back_off: Annotated[Ns, seconds("0.05", "86400", "The longest pause before a restart.")] = 30 * SECOND
+    settled: Annotated[Ns, seconds("0.05", "86400", "After running this long, earlier failures no longer count.")] = (
         30 * SECOND
     )
-    rebalance: Annotated[bool, key("Whether running components are moved when that pays.")] = False
-    gain: Annotated[float, key("How much better it must run elsewhere, as a share of now, to be moved.", 0.05, 100)] = (
-        0.3
-    )
-    steady: Annotated[Ns, seconds("0.05", "3600", "For how long that must be so.")] = 10 * SECOND
-    rest: Annotated[Ns, seconds("0.05", "86400", "A component that was placed or moved stays for this long.")] = (
+    rebalance: Annotated[bool, key("Move running components when that pays.")] = False
+    gain: Annotated[float, key("Gain in speed that a move must promise, as a share of the present.", 0.05, 100)] = 0.3
+    steady: Annotated[Ns, seconds("0.05", "3600", "Time for which a move must promise that gain.")] = 10 * SECOND
+    rest: Annotated[Ns, seconds("0.05", "86400", "A component stays this long after it was placed or moved.")] = (
         60 * SECOND
     )
 
@@ -177,7 +176,7 @@ DEFAULT_PLACEMENT: Final = PlacementPolicy()
 
 
 class Fleet(Struct, frozen=True):
-    """One mesh with one RCM at a time; the same on every host, but for the node's own part of `mesh`."""
+    """One mesh with one RCM at a time; equal on every host, except for the node's own part of `mesh`."""
 
     name: str
     candidates: tuple[str, ...]
@@ -189,14 +188,14 @@ class Fleet(Struct, frozen=True):
     timing: Timing
     placement: PlacementPolicy = DEFAULT_PLACEMENT
     min_runtime: Ns = MIN_RUNTIME
-    """For how long a hold is protected where its program says nothing."""
+    """Minimum runtime of requests that give none."""
     devices: Mapping[str, tuple[str, ...]] = {}
-    """The RCs that are expected, by their host."""
+    """The expected RCs by host."""
     security: Path | None = None
     """The folder of this host's or this user's certificate; None: a plain mesh, on which `access` is advice."""
     access: AccessPolicy = AccessPolicy()
     file: Path | None = None
-    """Of a secured fleet: where this was read. Programs look there for changed rights."""
+    """Path of a secured fleet's file. Programs reread it for changed rights."""
 
     @property
     def operator_priority(self) -> int:
@@ -205,14 +204,15 @@ class Fleet(Struct, frozen=True):
 
     @property
     def silence(self) -> Ns:
-        """A leader that published nothing for so long hangs, or is gone: longer than a few heartbeats and a lease."""
+        """A leader without publications for this long, in ns, hangs or is gone: four heartbeats, at least a mesh
+        lease."""
         return max(4 * self.timing.heartbeat, round(self.mesh.lease * SECOND))
 
     def may_lead(self, host: str) -> bool:
         return not self.candidates or host in self.candidates
 
 
-# The file as it is written
+# The tables of the file
 
 
 class FleetTable(Struct, frozen=True, forbid_unknown_fields=True):
@@ -221,52 +221,49 @@ class FleetTable(Struct, frozen=True, forbid_unknown_fields=True):
     name: Annotated[str, key("Hosts of one name find each other.", example="lab")] = "zscout"
     candidates: Annotated[
         tuple[str, ...],
-        key("Hosts that may lead, best first; none: every one.", most=MAX_CANDIDATES, example=["anvil"]),
+        key("Hosts that may lead, best first; none: all hosts.", most=MAX_CANDIDATES, example=["anvil"]),
     ] = ()
-    strategy: Annotated[StrategyName, key("By which the RCM schedules.")] = "adaptive"
+    strategy: Annotated[StrategyName, key("The RCM's scheduling strategy.")] = "adaptive"
     operator_priority: Annotated[
-        int, key("ARCs of this priority and above are an operator's: nothing keeps them.", 0, 1_000_000_000)
+        int, key("ARCs of this priority and above are an operator's: no other rule delays them.", 0, 1_000_000_000)
     ] = DEFAULT.operator_priority
-    preempt: Annotated[Preempt, key("When one ARC may take the hold of another of lower priority.")] = DEFAULT.preempt
+    preempt: Annotated[Preempt, key("When an ARC may preempt a hold of lower priority.")] = DEFAULT.preempt
     preempt_budget: Annotated[
         float,
-        key(
-            "`adaptive`: who lost this part of its minimum runtime to others is protected from all but operators.",
-            0,
-            1e6,
-        ),
+        key("`adaptive`: only operators preempt an ARC that lost this share of its minimum runtime to others.", 0, 1e6),
     ] = DEFAULT.preempt_budget
     patience: Annotated[
         Ns | None,
         seconds(
             "0",
             "31622400",
-            "`adaptive`: after this long an ARC that waits is due; 0: never; unset: 28 mean minimum runtimes.",
+            "`adaptive`: a waiting ARC is due after this long; 0: never; unset: 28 mean minimum runtimes.",
         ),
     ] = None
     promise: Annotated[
-        Promise, key("Whom an ARC that is due goes before: equal and lower priority, or all but operators.")
+        Promise, key("ARCs that may not pass a due ARC: of equal and lower priority, or all but operators.")
     ] = DEFAULT.promise
-    min_runtime: Annotated[
-        Ns, seconds("0.001", "31622400", "For how long a hold is protected where its program says nothing.")
-    ] = MIN_RUNTIME
+    min_runtime: Annotated[Ns, seconds("0.001", "31622400", "Minimum runtime of requests that give none.")] = (
+        MIN_RUNTIME
+    )
 
 
 class FairSharesTable(Struct, frozen=True, forbid_unknown_fields=True):
-    """The table [fair_shares]: of one priority that group goes first which lately had least of what others waited for.
-    Off where it is not there."""
+    """The table [fair_shares]: within one priority, groups with less recent contended usage go first. Without the table
+    groups do not matter."""
 
-    half_life: Annotated[Ns, seconds("60", "31622400", "After this long half of what a group had counts.")] = DAY
+    half_life: Annotated[Ns, seconds("60", "31622400", "After this long usage counts half.")] = DAY
     weights: Annotated[
         Mapping[str, Annotated[float, Meta(ge=0.001, le=1_000)]],
         key(
-            "By group, or name that is in none: the parts that they are to have, 1 where nothing is said.",
+            "Share by group, or by name without a group, relative to the others; 1 if not given.",
             most=MAX_NAMES,
             example={"arms": 2},
         ),
     ] = {}
     patience: Annotated[
-        Ns, seconds("0", "31622400", "That of groups that had more than another that waits; `fleet.patience` or more.")
+        Ns,
+        seconds("0", "31622400", "Patience of groups that used more than a waiting group; `fleet.patience` or more."),
     ] = FAIR_PATIENCE
 
 
@@ -283,27 +280,27 @@ class FleetFile(Struct, frozen=True, forbid_unknown_fields=True):
     roles: Roles = Roles()
     groups: Annotated[
         Mapping[str, Names],
-        key("Names that are one to [access] and [quotas].", most=MAX_NAMES, example={"arms": ["bob"]}),
+        key("Names that [access] and [quotas] treat alike.", most=MAX_NAMES, example={"arms": ["bob"]}),
     ] = {}
     access: Annotated[
         Mapping[str, Names],
         key("RCs that only these names and groups may hold.", most=MAX_NAMES, example={"robot/arm*": ["arms"]}),
     ] = {}
     quotas: Annotated[
-        Mapping[str, Quota], key("By name or group.", most=MAX_NAMES, example={"arms": {"rcs": 4, "arcs": 8}})
+        Mapping[str, Quota], key("Quotas by name or group.", most=MAX_NAMES, example={"arms": {"rcs": 4, "arcs": 8}})
     ] = {}
     ceilings: Annotated[
         Mapping[Rank, Ceiling],
-        key("By role: client (programs on machines, too), operator.", example={"client": {"priority": 5}}),
+        key("Limits by role: client (also programs on machines), operator.", example={"client": {"priority": 5}}),
     ] = {}
     devices: Annotated[
         Mapping[str, Annotated[tuple[str, ...], Meta(max_length=MAX_DEVICES)]],
-        key("The RCs that are expected there, by host.", most=MAX_HOSTS, example={"anvil": ["robot/scout33"]}),
+        key("Expected RCs by host.", most=MAX_HOSTS, example={"anvil": ["robot/scout33"]}),
     ] = {}
 
 
 def load_fleet(path: Path, named_by: str = "") -> Fleet:
-    """Reads a fleet file; an error says what named it. Raises BadInput."""
+    """Read a fleet file. `named_by`, such as an option, is added to errors. Raises BadInput."""
     try:
         fleet = _fleet(read_toml(path, FleetFile), Where(str(path)), path.parent)
         return fleet if fleet.security is None else structs.replace(fleet, file=path.absolute())
@@ -312,12 +309,12 @@ def load_fleet(path: Path, named_by: str = "") -> Fleet:
 
 
 def default_fleet() -> Fleet:
-    """The fleet of those who wrote no file."""
+    """The fleet without a file."""
     return _fleet(FleetFile(), Where("defaults"))
 
 
 def fleet_from_env() -> Fleet:
-    """The fleet whose file `ZSCOUT_FLEET` names; if that is unset or empty, the default. Raises BadInput."""
+    """The fleet in the file `$ZSCOUT_FLEET`; the default if it is unset or empty. Raises BadInput."""
     path = os.environ.get(FLEET_VARIABLE)
     return load_fleet(Path(path), f"${FLEET_VARIABLE}") if path else default_fleet()
 
@@ -335,7 +332,7 @@ def _fleet(file: FleetFile, top: Where, folder: Path = Path()) -> Fleet:
     check_access(access, top)
     if table.promise != "equals" and (table.strategy != "adaptive" or table.patience == 0):
         raise (at / "promise").bad(
-            f'is "{table.promise}", but only "adaptive" with some patience promises anything',
+            f'is "{table.promise}", but needs the strategy "adaptive" with some patience',
             'write strategy = "adaptive" and a patience above 0, or promise = "equals"',
         )
     unbound = SchedulingPolicy(
@@ -366,12 +363,12 @@ def _fleet(file: FleetFile, top: Where, folder: Path = Path()) -> Fleet:
 
 
 def _fair_shares(file: FleetFile, access: AccessPolicy, at: Where) -> FairShares | None:
-    """What the table says, without groups: `Authority` has these. Raises BadInput."""
+    """The table as a policy, without groups, which `Authority` adds. Raises BadInput."""
     table = file.fair_shares
     if table is None:
         return None
     if file.fleet.strategy != "adaptive":
-        what = f'is there, but only "adaptive" has an order of groups, not "{file.fleet.strategy}"'
+        what = f'needs the strategy "adaptive", not "{file.fleet.strategy}"'
         raise at.bad(what, 'write strategy = "adaptive" under [fleet], or remove the table')
     for name in table.weights:
         here = at / "weights" / name
@@ -388,7 +385,7 @@ def _fair_shares(file: FleetFile, access: AccessPolicy, at: Where) -> FairShares
 
 
 def keys_folder(table: SecurityTable, beside: Path, top: Where) -> Path:
-    """The folder of the certificate that this process is to show. Raises BadInput."""
+    """The folder of this process's certificate. Raises BadInput."""
     text, at = os.environ.get(KEYS_VARIABLE) or table.folder, top / "security" / "folder"
     if not text or "\0" in text:
         raise at.bad(f"{quoted(text)} is not a folder", f"name one, as in {KEYS}")
@@ -399,7 +396,8 @@ def keys_folder(table: SecurityTable, beside: Path, top: Where) -> Path:
 
 
 def check_security(fleet: Fleet, top: Where) -> None:
-    """Refuses certificates without roles, and what the roles do not allow. Raises BadInput."""
+    """Check that a secured fleet has managers, TLS endpoints, and candidates and devices that the roles allow. Raises
+    BadInput."""
     if fleet.security is None:
         return
     access = fleet.access
@@ -437,9 +435,9 @@ def _check_devices(devices: Mapping[str, tuple[str, ...]], at: Where) -> None:
 
 def _check_timing(timing: Timing, lease: float, at: Where) -> None:
     for bound, meaning in (
-        # A takeover begins when the old RCM's lease is over; no hold may end while the new one asks what stands.
+        # A takeover begins when the old RCM's lease is over; no hold may end while the new RCM collects the holds.
         (round(lease * SECOND) + timing.rebuild, "mesh.lease + timing.rebuild"),
-        # One lost heartbeat ends nothing.
+        # A single lost heartbeat must not end holds.
         (2 * timing.heartbeat, "2 * timing.heartbeat"),
     ):
         if timing.hold_lease <= bound:
@@ -451,7 +449,7 @@ def _check_timing(timing: Timing, lease: float, at: Where) -> None:
 
 
 def check_links(listen: tuple[str, ...], connect: tuple[str, ...], interface: str, at: Where) -> None:
-    """Refuses endpoints and interfaces that Zenoh would not understand. Raises BadInput."""
+    """Raises BadInput for endpoints and interfaces that Zenoh would not accept."""
     remedy = f'write protocol/host:port, as in "tcp/127.0.0.1:7447"; protocols: {", ".join(_PROTOCOLS)}'
     for name, endpoints, lowest_port in (("listen", listen, 0), ("connect", connect, 1)):
         for number, endpoint in enumerate(endpoints):
@@ -466,7 +464,7 @@ def check_links(listen: tuple[str, ...], connect: tuple[str, ...], interface: st
 
 
 def check_sites(mesh: MeshConfig, at: Where) -> None:
-    """Refuses a relay of fewer than two sites, or of one of its own. Raises BadInput."""
+    """Raises BadInput for a relay of fewer than two sites, or with a site of its own."""
     if mesh.site is not None:
         check_name(mesh.site, at / "site")
     check_names(mesh.relay, at / "relay")
@@ -477,7 +475,7 @@ def check_sites(mesh: MeshConfig, at: Where) -> None:
 
 
 def check_multicast(address: str, where: Where) -> None:
-    """Refuses what is not a multicast `ip:port`. Raises BadInput."""
+    """Raises BadInput unless `address` is a multicast `ip:port`."""
     host, _, port = address.rpartition(":")
     ip = ip_of(host.removeprefix("[").removesuffix("]"))
     if ip is None or not ip.is_multicast or not re.fullmatch("[0-9]{1,5}", port) or not 0 < int(port) < 65_536:
@@ -487,12 +485,12 @@ def check_multicast(address: str, where: Where) -> None:
 def _is_host(host: str) -> bool:
     if host.startswith("["):
         return isinstance(ip_of(host[1:-1]), ipaddress.IPv6Address)
-    # Digits and dots alone are meant as an IPv4 address.
+    # A text of digits and dots is an IPv4 address.
     return ip_of(host) is not None if re.fullmatch("[0-9.]+", host) else True
 
 
 def beside(mesh: MeshConfig) -> MeshConfig:
-    """How a second process joins where a node does: on ports of its own, linked to the node's, and without relaying."""
+    """The settings of a second process beside a node: free ports, a connection to the node's, and no relaying."""
     listen, connect = [], list(mesh.connect)
     for found in filter(None, map(_ENDPOINT.fullmatch, mesh.listen)):
         protocol, host, port, more = found["protocol"], found["host"], found["port"], found["more"] or ""
@@ -505,7 +503,7 @@ def beside(mesh: MeshConfig) -> MeshConfig:
 
 
 def ip_of(text: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
-    """The IP address that a text is, or None."""
+    """Parse an IP address; None if it is not one."""
     try:
         return ipaddress.ip_address(text)
     except ValueError:

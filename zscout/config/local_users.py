@@ -1,4 +1,4 @@
-"""Other users of this machine: which user holds a name or a port that anybody may take first."""
+"""Other users of this machine: which user holds a name or port that is free for all users to take."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def user_name(uid: Uid) -> str:
 
 
 def listeners(address: Address, port: int) -> Iterator[Uid]:
-    """The users of the sockets of this machine that listen exactly there. Raises OSError."""
+    """The users of this machine's sockets that listen at exactly this address. Raises OSError."""
     for table in TABLES:
         with suppress(FileNotFoundError):
             for line in table.read_text().splitlines()[1:]:

@@ -1,4 +1,4 @@
-"""The node file: what one host does in its fleet."""
+"""The node file: the settings of one host."""
 
 from __future__ import annotations
 
@@ -44,19 +44,19 @@ from zscout.types import SECOND, Ns
 MAX_RCS: Final = 1_000
 """RCs in one node file."""
 MAX_KINDS: Final = 256
-"""Kinds of components that a node may be limited to, and that it lists."""
+"""Kinds of components in the list of allowed kinds, and in the list that a node reports."""
 MAX_STARTED: Final = 256
-"""Components of one node that run at one time; a load report holds no more."""
+"""Running components of one node; a load report holds no more."""
 FRAMES: Final = 2.0
-"""Pictures a second that a recorder shows of each camera, by default."""
+"""Default frames per second that a recorder shows of each camera."""
 
 STATE: Final = 'state = "/var/lib/zscout"'
 PAST: Final = 24 * 3_600 * SECOND
-"""Of the time before a recording, asked of the journals, by default."""
+"""Default time before a recording that it shows from the journals."""
 MAX_PAST: Final = 31 * 86_400
 """Seconds."""
 RECORDED: Final = 5_000
-"""Megabytes of recordings that are kept, by default."""
+"""Default megabytes of recordings to keep."""
 
 LoadKind = bool | Literal["tree"]
 
@@ -65,20 +65,20 @@ class RecorderConfig(Struct, frozen=True):
     """The recorder: the files it writes and where its live view is served."""
 
     path: Path
-    """The folder of recordings; relative ones in a file are relative to that file."""
+    """The folder of recordings."""
     bind: str
     """IP address; loopback unless the file allowed others."""
     port: int
     frames: float = FRAMES
-    """Frames a second shown of each camera; 0: none."""
+    """Frames per second shown of each camera; 0: none."""
     limit: int = RECORDED
-    """Megabytes (10^6 bytes) of this fleet's recordings that are kept."""
+    """Megabytes (10^6 bytes) of this fleet's recordings to keep."""
     past: Ns = PAST
-    """Of the time before a recording, asked of the journals; 0: none."""
+    """Time before a recording that it shows from the journals; 0: none."""
 
 
 class MetricsConfig(Struct, frozen=True):
-    """Where the node's figures are served."""
+    """Address of the node's metrics server."""
 
     bind: str
     """IP address; loopback unless the file allowed others."""
@@ -86,7 +86,7 @@ class MetricsConfig(Struct, frozen=True):
 
 
 class CalendarConfig(Struct, frozen=True):
-    """Where the fleet's bookings are served as calendars."""
+    """Address of the node's calendar server."""
 
     bind: str
     """IP address; loopback unless the file allowed others."""
@@ -94,28 +94,26 @@ class CalendarConfig(Struct, frozen=True):
 
 
 class ComponentsConfig(Struct, frozen=True, forbid_unknown_fields=True):
-    """The table [components]: what a node starts for others."""
+    """The table [components]: limits of the components that a node starts."""
 
-    allow: Annotated[bool, key("Whether it starts components at all.")] = True
+    allow: Annotated[bool, key("Start components.")] = True
     kinds: Annotated[
         Annotated[tuple[str, ...], Meta(max_length=MAX_KINDS)] | None,
-        key("Only these kinds (entry points); without it all that are installed.", example=["counter"]),
+        key("Start only these kinds (entry points). Default: all installed kinds.", example=["counter"]),
     ] = None
-    max: Annotated[int, key("Components that run at one time.", 1, MAX_STARTED)] = 64
+    max: Annotated[int, key("Greatest number of running components.", 1, MAX_STARTED)] = 64
 
 
 class JournalConfig(Struct, frozen=True, forbid_unknown_fields=True):
-    """The table [journal]: what a candidate keeps of the holds that are over, in the folder `state`."""
+    """The table [journal]: a candidate's record of ended holds, in the folder `state`."""
 
-    off: Annotated[bool, key("Whether it keeps none.")] = False
-    max_age: Annotated[Ns, seconds("3600", "315360000", "Holds that ended longer ago are forgotten.")] = (
-        90 * 86_400 * SECOND
-    )
-    max_size: Annotated[int, key("Of the file; what ended longest ago goes first.", 1, 10_000, unit="MB")] = 64
+    off: Annotated[bool, key("Keep no journal.")] = False
+    max_age: Annotated[Ns, seconds("3600", "315360000", "Forget holds that ended longer ago.")] = 90 * 86_400 * SECOND
+    max_size: Annotated[int, key("Size of the file; the oldest holds are removed first.", 1, 10_000, unit="MB")] = 64
 
 
 class Node(Struct, frozen=True):
-    """What one host does in its fleet."""
+    """The settings of one host in its fleet."""
 
     host: str
     fleet: Fleet
@@ -124,35 +122,37 @@ class Node(Struct, frozen=True):
     load: LoadKind
     rcs: tuple[RcConfig, ...]
     recorder: RecorderConfig | None
-    """None: this node does not record."""
+    """None: it does not record."""
     labels: tuple[str, ...] = ()
     components: ComponentsConfig = ComponentsConfig()
     metrics: MetricsConfig | None = None
-    """None: it serves no figures."""
+    """None: it serves no metrics."""
     calendar: CalendarConfig | None = None
     """None: it serves no calendars."""
     notify: NotifyConfig | None = None
-    """None: it tells nobody."""
+    """None: it sends no notifications."""
     journal: JournalConfig = JournalConfig()
     state: Path | None = None
-    """The folder of what must outlive the node (`state_folder.py`); None: where such folders usually are."""
+    """Folder for files that outlive the node (`state_folder.py`); None: the user's default."""
 
 
-# The file as it is written
+# The tables of the file
 
 
 class NodeTable(Struct, frozen=True, forbid_unknown_fields=True):
     """The table [node]."""
 
-    host: Annotated[str | None, key("Name of the host; without it its hostname.", example="anvil")] = None
-    fleet: Annotated[str | None, key("The fleet file, relative to this one.", example="lab.toml")] = None
-    candidate: Annotated[bool, key("Whether this host may lead, if `candidates` let it.")] = True
+    host: Annotated[str | None, key("Name of the host. Default: its hostname.", example="anvil")] = None
+    fleet: Annotated[str | None, key("The fleet file, relative to this file.", example="lab.toml")] = None
+    candidate: Annotated[bool, key("This host may lead, if `candidates` of the fleet file allow it.")] = True
     load: Annotated[
-        LoadKind, key('Whether it reports its load; "tree": only that of this node and what it started.')
+        LoadKind, key('Report the load of this host; "tree": only of this node and the processes it started.')
     ] = True
-    labels: Annotated[tuple[str, ...], key("For components that need them.", most=MAX_LABELS, example=["gpu"])] = ()
+    labels: Annotated[
+        tuple[str, ...], key("Labels that components may require.", most=MAX_LABELS, example=["gpu"])
+    ] = ()
     state: Annotated[
-        str | None, key("The folder of what must outlive the node, relative to this file.", example="/var/lib/zscout")
+        str | None, key("Folder for files that outlive the node, relative to this file.", example="/var/lib/zscout")
     ] = None
 
 
@@ -162,20 +162,20 @@ class RecorderTable(Struct, frozen=True, forbid_unknown_fields=True):
     path: Annotated[str, key("The folder of recordings, relative to this file.")] = "runs"
     bind: Annotated[str, key("IP address of the live view.")] = "127.0.0.1"
     port: Annotated[int, key("TCP port of the live view.", 1, 65_535)] = 9876
-    allow_remote: Annotated[bool, key("Whether `bind` may let other hosts in.")] = False
-    frames: Annotated[float, key("Shown of each camera; 0: none.", 0, 30, unit="frames/s")] = FRAMES
+    allow_remote: Annotated[bool, key("Allow a `bind` that other hosts can reach.")] = False
+    frames: Annotated[float, key("Frames shown of each camera; 0: none.", 0, 30, unit="frames/s")] = FRAMES
     limit: Annotated[
-        int, key("Kept of this fleet's recordings in `path`; the oldest go first.", 300, 1_000_000, unit="MB")
+        int, key("Size of this fleet's recordings in `path`; the oldest are removed first.", 300, 1_000_000, unit="MB")
     ] = RECORDED
-    past: Annotated[Ns, seconds("0", str(MAX_PAST), "Of before a recording, shown from journals; 0: none.")] = PAST
+    past: Annotated[Ns, seconds("0", str(MAX_PAST), "Time before a recording, shown from journals; 0: none.")] = PAST
 
 
 class MetricsTable(Struct, frozen=True, forbid_unknown_fields=True):
-    """The table [metrics]. With it the node serves its figures to Prometheus, over plain HTTP."""
+    """The table [metrics]. With it the node serves metrics to Prometheus, over plain HTTP."""
 
     bind: Annotated[str, key("IP address.")] = "127.0.0.1"
     port: Annotated[int, key("TCP port.", 1, 65_535)] = 9464
-    allow_remote: Annotated[bool, key("Whether `bind` may let other hosts in.")] = False
+    allow_remote: Annotated[bool, key("Allow a `bind` that other hosts can reach.")] = False
 
 
 class CalendarTable(Struct, frozen=True, forbid_unknown_fields=True):
@@ -183,19 +183,19 @@ class CalendarTable(Struct, frozen=True, forbid_unknown_fields=True):
 
     bind: Annotated[str, key("IP address.")] = "127.0.0.1"
     port: Annotated[int, key("TCP port.", 1, 65_535)] = 9465
-    allow_remote: Annotated[bool, key("Whether `bind` may let other hosts in.")] = False
+    allow_remote: Annotated[bool, key("Allow a `bind` that other hosts can reach.")] = False
 
 
 class NodeMeshTable(Struct, frozen=True, forbid_unknown_fields=True):
-    """The table [mesh] of a node file: what this host has instead of the fleet file's."""
+    """The table [mesh] of a node file: it overrides the fleet file for this host."""
 
     listen: Annotated[Endpoints | None, key("Endpoints of this host.", example=["tcp/0.0.0.0:7447"])] = None
     connect: Annotated[Endpoints | None, key("Endpoints of other hosts.", example=["tcp/anvil:7447"])] = None
     interface: Annotated[str | None, key("Network interface for multicast.", example="eth0")] = None
     site: Annotated[str | None, key("The site of this host.", example="north")] = None
-    relay: Annotated[
-        Sites | None, key("Makes this node the relay between these sites.", example=["north", "south"])
-    ] = None
+    relay: Annotated[Sites | None, key("Make this node the relay between these sites.", example=["north", "south"])] = (
+        None
+    )
 
 
 class NodeFile(Struct, frozen=True, forbid_unknown_fields=True):
@@ -204,7 +204,7 @@ class NodeFile(Struct, frozen=True, forbid_unknown_fields=True):
     node: NodeTable = NodeTable()
     mesh: NodeMeshTable = NodeMeshTable()
     rc: Annotated[tuple[dict[str, Any], ...], Meta(max_length=MAX_RCS)] = ()
-    """Each is read by itself: which keys it may have is its driver's."""
+    """Read one by one, since the allowed keys depend on the driver."""
     recorder: RecorderTable | None = None
     security: SecurityTable | None = None
     components: ComponentsConfig = ComponentsConfig()
@@ -215,7 +215,7 @@ class NodeFile(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def load_node(path: Path) -> Node:
-    """Reads a node file, and the fleet file that it names (relative to itself). Raises BadInput."""
+    """Read a node file, and the fleet file that it names (relative to the node file). Raises BadInput."""
     file = read_toml(path, NodeFile)
     named = file.node.fleet
     fleet = load_fleet(path.parent / named, f"node.fleet in {path}") if named is not None else default_fleet()
@@ -223,7 +223,7 @@ def load_node(path: Path) -> Node:
 
 
 def default_node() -> Node:
-    """The node of those who wrote no file: named by the host, without RCs, in the default fleet."""
+    """The node without a file: named by the hostname, without RCs, in the default fleet."""
     return _node(NodeFile(), default_fleet(), Path(), Where("defaults"))
 
 
@@ -232,7 +232,7 @@ def _node(file: NodeFile, fleet: Fleet, folder: Path, top: Where) -> Node:
     check_folder_name(host, top / "node" / "host")
     own = {name: value for name, value in structs.asdict(file.mesh).items() if value is not None}
     if file.mesh.relay and file.mesh.site is None:
-        own["site"] = None  # that of the fleet file is the site of those who do not relay
+        own["site"] = None  # the fleet file's site is for hosts that do not relay
     mesh = structs.replace(fleet.mesh, **own, shared=() if fleet.mesh.multicast else fleet.mesh.known_by)
     check_links(mesh.listen, mesh.connect, mesh.interface, top / "mesh")
     check_sites(mesh, top / "mesh")
@@ -270,7 +270,7 @@ def _node(file: NodeFile, fleet: Fleet, folder: Path, top: Where) -> Node:
 
 
 def _check_roles(host: str, rcs: Iterable[str], access: AccessPolicy, top: Where) -> None:
-    """Raises BadInput."""
+    """Raises BadInput if the roles do not allow this host or its RCs."""
     if not access.ranks_of(host) & MACHINES:
         remedy = "name it under [roles] of the fleet file, as manager or under node"
         raise (top / "node" / "host").bad(f"{quoted(host)} is not a machine of this fleet", remedy)
@@ -281,7 +281,7 @@ def _check_roles(host: str, rcs: Iterable[str], access: AccessPolicy, top: Where
 
 
 def _folder(text: str, folder: Path, at: Where, example: str) -> Path:
-    """The folder of this name, relative to that of the file. Raises BadInput."""
+    """A folder given relative to the file's `folder`. Raises BadInput."""
     if not text or "\0" in text:
         raise at.bad(f"{quoted(text)} is not a folder", f"name one, as in {example}")
     return folder / text
@@ -304,7 +304,7 @@ def _calendar(table: CalendarTable, at: Where) -> CalendarConfig:
 
 
 def _served_at(bind: str, what: str, at: Where, *, allow_remote: bool) -> str:
-    """The IP address. Raises BadInput."""
+    """Check the address to serve `what` at. Raises BadInput."""
     address = ip_of("127.0.0.1" if bind == "localhost" else bind)
     if address is None:
         raise (at / "bind").bad(f"{quoted(bind)} is not an IP address", 'write one, as in "127.0.0.1"')

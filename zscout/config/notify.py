@@ -1,5 +1,5 @@
-"""The table [notify] of a node file: who is told of what, and where. Its URLs are secrets: no error, log line or `repr`
-shows one."""
+"""The table [notify] of a node file: notifications to people, with their events and URLs. The URLs are secrets: no
+error, log line or `repr` shows them."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from zscout.config.strict import BadInput, Where, key, quoted, read_text, second
 from zscout.types import SECOND, Ns
 
 MAX_URLS: Final = 20
-"""In one list."""
+"""In a list."""
 MAX_USERS: Final = 200
 MAX_URL: Final = 2_000
 """Characters."""
@@ -28,7 +28,7 @@ Urls = Annotated[tuple[str, ...], Meta(max_length=MAX_URLS)]
 
 
 class Address(Struct, frozen=True):
-    """A URL, and where it stands: `notify.urls[0]`, which may be shown."""
+    """A URL, and its place in the file (`notify.urls[0]`), which may be shown."""
 
     at: str
     url: str
@@ -38,7 +38,7 @@ class Address(Struct, frozen=True):
 
 
 class _Written(NamedTuple):
-    """A URL as it stands in a file."""
+    """A URL and its place in a file."""
 
     url: str
     where: Where
@@ -46,27 +46,27 @@ class _Written(NamedTuple):
 
 
 class NotifyTable(Struct, frozen=True, forbid_unknown_fields=True):
-    """The table [notify]. With it this node tells people what happens, while it leads."""
+    """The table [notify]. With it this node sends notifications to people while it leads."""
 
     urls: Annotated[
         Urls,
         secret('texts in a list, as in ["mailtos://user:password@example.org"]'),
-        key("Apprise URLs that hear of all `events`; one without `://` is a file of such."),
+        key("Apprise URLs that get all `events`; an entry without `://` names a file with URLs."),
     ] = ()
     events: Annotated[
-        Annotated[tuple[NotifyEvent, ...], Meta(max_length=len(EVENTS))], key("Of which `urls` hear.")
+        Annotated[tuple[NotifyEvent, ...], Meta(max_length=len(EVENTS))], key("Events sent to `urls`.")
     ] = EVENTS
     users: Annotated[
         Annotated[Mapping[str, Urls], Meta(max_length=MAX_USERS)],
         secret('a table of lists, as in users = { ada = ["ntfys://ada-lab"] }'),
-        key("By user: who hears of that user's requests and bookings."),
+        key("By user: URLs that get the events of this user's requests and bookings."),
     ] = {}
-    after: Annotated[Ns, seconds("0", "86400", "`yours_now`: only after a wait of so long.")] = 60 * SECOND
-    per_minute: Annotated[int, key("Sent to one URL at most; the rest is left out.", 1, 600)] = 20
+    after: Annotated[Ns, seconds("0", "86400", "`yours_now`: only after a wait this long.")] = 60 * SECOND
+    per_minute: Annotated[int, key("Notifications to one URL at most; the rest is dropped.", 1, 600)] = 20
 
 
 class NotifyConfig(Struct, frozen=True):
-    """Who is told of what."""
+    """The table [notify] with its files read."""
 
     urls: tuple[Address, ...]
     events: tuple[NotifyEvent, ...]
@@ -76,22 +76,22 @@ class NotifyConfig(Struct, frozen=True):
 
 
 def read_notify(table: NotifyTable, folder: Path, at: Where) -> NotifyConfig:
-    """The table, with what its files hold; `folder` is that of the node file. Raises BadInput."""
+    """Read the files that the table names, and check all URLs; `folder`: of the node file. Raises BadInput."""
     check_installed("apprise", at)
     if not table.urls and not table.users:
-        raise at.bad("sends nothing to anybody", "name urls or users, or remove the table")
+        raise at.bad("has neither urls nor users", "add either, or remove the table")
     for user in table.users:
         if not user or len(user) > MAX_NAME or not user.isprintable():
             raise (at / "users").bad(f"{quoted(user)} is not a user", f"write 1 to {MAX_NAME} printable characters")
-    heard = [*_written(table.urls, folder, at / "urls")]
+    shared = [*_written(table.urls, folder, at / "urls")]
     by_user = {user: [*_written(urls, folder, at / "users" / user)] for user, urls in table.users.items()}
-    every = dict.fromkeys(one.url for some in (heard, *by_user.values()) for one in some)
+    distinct = dict.fromkeys(written.url for urls in (shared, *by_user.values()) for written in urls)
     try:
-        known = {url for url, is_one in zip(every, usable([*every]), strict=True) if is_one}
+        known = {url for url, is_usable in zip(distinct, usable([*distinct]), strict=True) if is_usable}
     except NoAnswer as error:
         raise at.bad(f"can't be checked: {error}", "try apprise yourself: apprise --dry-run -b test URL") from None
-    users = {user: tuple(_address(one, known) for one in some) for user, some in by_user.items()}
-    urls = tuple(_address(one, known) for one in heard)
+    users = {user: tuple(_address(written, known) for written in urls) for user, urls in by_user.items()}
+    urls = tuple(_address(written, known) for written in shared)
     return NotifyConfig(urls, table.events, users, table.after, table.per_minute)
 
 
@@ -117,7 +117,7 @@ def _written(urls: tuple[str, ...], folder: Path, at: Where) -> Iterator[_Writte
 
 def _file_name(text: str, at: Where) -> str:
     if not re.fullmatch(r"[\w./-]{1,255}", text):
-        # It may be a URL with a slip.
+        # The text may be a mistyped URL, so the error does not show it.
         raise at.bad("is neither a URL nor the name of a file", "write one, as in mailtos://user:password@example.org")
     return text
 
@@ -128,7 +128,7 @@ def _address(written: _Written, known: Container[str]) -> Address:
     if len(url) > MAX_URL or not url.isprintable():
         what = "is too long, or not printable"
     elif url not in known:
-        what = "is no URL that Apprise can use (not shown: it may hold a secret)"
+        what = "is not a URL that Apprise supports (not shown: it may hold a secret)"
     if what:
         raise at.bad(f"{line}{what}", "https://appriseit.com shows the form for each service")
     return Address(at.key or f"{at.source} {line}".strip(), url)

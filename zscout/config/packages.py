@@ -1,4 +1,5 @@
-"""What an installation may lack (requirements/light.txt leaves it out, or an extra brings it), and how to get it."""
+"""Packages that an installation may lack (requirements/light.txt omits them, or an extra adds them), and how to get
+them."""
 
 from __future__ import annotations
 
@@ -12,14 +13,14 @@ from typing import Final
 from zscout.config.strict import Where
 
 MODULES: Final = {"cv2": "opencv-python-headless", "numpy": "numpy", "rerun": "rerun-sdk"}
-"""What a light installation leaves out: the package that each module comes with."""
+"""Modules that a light installation omits, each with its package."""
 EXTRAS: Final = {"apprise": "apprise", "cryptography": "cryptography", "prometheus_client": "prometheus-client"}
-"""The same of what only an extra brings."""
+"""Modules that only an extra adds, each with its package."""
 
 
 def how_to_get(error: ImportError) -> str:
-    """What is missing where this import failed, with the command that brings it, to stand behind the name of what needs
-    it; empty if it is none of these."""
+    """Name the missing package of this import error and the command that installs it, as `needs numpy, ...`, to follow
+    the name of a feature. "" for any other module."""
     package = (MODULES | EXTRAS).get((error.name or "").partition(".")[0])
     if package is None or not isinstance(error, ModuleNotFoundError):
         return ""
@@ -27,13 +28,13 @@ def how_to_get(error: ImportError) -> str:
         required = metadata.requires("zscout") or []
     except metadata.PackageNotFoundError:  # run from its sources
         required = []
-    wanted = next((one.partition(";")[0] for one in required if re.split(r"[^\w.-]", one)[0] == package), package)
+    wanted = next((line.partition(";")[0] for line in required if re.split(r"[^\w.-]", line)[0] == package), package)
     command = shlex.join([sys.executable, "-m", "pip", "install", wanted])
-    return f"needs {package}, which is not installed here; {command} brings it"
+    return f"needs {package}, which is not installed here; install it with {command}"
 
 
 def check_installed(module: str, at: Where) -> None:
-    """Refuses what stands `at` a place in a file where the module that it needs is not installed. Raises BadInput."""
+    """Raises BadInput about this place in a file if the module that it needs is not installed."""
     if find_spec(module) is None:
         what, _, remedy = how_to_get(ModuleNotFoundError(name=module)).partition("; ")
         raise at.bad(what, remedy)

@@ -1,4 +1,4 @@
-"""What a fleet may choose about scheduling."""
+"""The scheduling options of a fleet."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Final, Literal, TypeAlias
 from zscout.types import SECOND, Ns
 
 PATIENCE: Final[Ns] = 142 * SECOND
-"""In ns: the least where it follows the runtimes. Measured: docs/study.md."""
+"""Least patience in ns where it follows the runtimes. Measured: docs/study.md."""
 PREEMPT_BUDGET: Final = 0.25
 """Default. Measured: docs/scheduling.md."""
 FAIR_PATIENCE: Final[Ns] = 3_600 * SECOND
@@ -23,7 +23,7 @@ Promise: TypeAlias = Literal["equals", "all"]
 
 @dataclass(frozen=True, slots=True)
 class RcQuota:
-    """How many RCs some owners (hosts and people) together may hold at one time."""
+    """The number of RCs that some owners (hosts and people) may hold together at one time."""
 
     name: str
     owners: frozenset[str]
@@ -32,48 +32,47 @@ class RcQuota:
 
 @dataclass(frozen=True, slots=True)
 class FairShares:
-    """Groups of equal priority in the order of what they lately had and others waited for (`fair_shares.py`)."""
+    """Among ARCs of equal priority, groups with less recent contended usage go first (`fair_shares.py`)."""
 
     half_life: Ns
-    """Time in ns after which a group is charged half of what it had."""
+    """Time in ns after which usage counts half."""
     weights: Mapping[str, float] = field(default_factory=dict)
-    """By group: how much of what is contended is to be its, against the others' weights; 1 where nothing is said."""
+    """By group: its share of contended devices relative to the other groups; 1 if not given."""
     patience: Ns = FAIR_PATIENCE
-    """In ns: that of the ARCs of groups that had more than another that waits. `SchedulingPolicy.patience` is that of
-    the others."""
+    """Patience in ns of groups that used more than a waiting group; other groups have `SchedulingPolicy.patience`."""
     groups: Mapping[str, str] = field(default_factory=dict)
-    """By owner (host or person): its group. Any other is a group of its own."""
+    """The group of an owner (host or person). An owner without an entry forms its own group."""
 
 
 @dataclass(frozen=True, slots=True)
 class SchedulingPolicy:
-    """The knobs. The defaults are the paper's rules, and bounded waiting among equals under `adaptive`."""
+    """The options. The defaults are the paper's rules, and bounded waiting among equals under `adaptive`."""
 
     preempt: Preempt = "always"
-    """`after_min_runtime`: nobody but an operator takes a hold before its minimum runtime is over."""
+    """`after_min_runtime`: only operators preempt a hold within its minimum runtime."""
     operator_priority: int = OPERATOR_PRIORITY
-    """ARCs of this priority and above are an operator's: no knob keeps them waiting."""
+    """ARCs of this priority and above are an operator's: no other option delays them."""
     preempt_budget: float = PREEMPT_BUDGET
-    """`adaptive`: once an ARC has lost this part of its minimum runtime to others, only operators preempt it."""
+    """`adaptive`: once an ARC has lost this share of its minimum runtime to others, only operators preempt it."""
     patience: Ns | Literal["runtimes"] | None = "runtimes"
-    """`adaptive`: time in ns after which an ARC that waits is due (`reservations.py`); `runtimes`: it follows the
-    minimum runtimes (`patience.py`); None: never."""
+    """`adaptive`: time in ns after which a waiting ARC is due (`reservations.py`); `runtimes`: it follows the minimum
+    runtimes (`patience.py`); None: never."""
     promise: Promise = "equals"
-    """The ARCs that may not pass a due ARC: those of equal and lower priority, or all but operators. With
-    `all`, what a due ARC is granted at last is not preempted within its minimum runtime either."""
+    """ARCs that may not pass a due ARC. `equals`: those of equal and lower priority; `all`: all but operators. With
+    `all`, only operators preempt the due ARC's hold within its minimum runtime."""
     max_running_per_host: int | None = None
     """ARCs that the clients of one host may have running at one time; None: any number."""
     max_runtime: Ns | None = None
-    """Time in ns after which every hold ends as completed, kept or not, whoever's it is; None: never. The hold of a
-    booking lasts until the booking's end at least."""
+    """Time in ns after which every hold ends as completed, kept or not, also an operator's; None: never. The hold of a
+    booking lasts at least until the booking's end."""
     max_booking: Ns | None = None
     """The longest booking in ns; None: any."""
     rc_quotas: Mapping[str, tuple[RcQuota, ...]] = field(default_factory=dict)
     """By owner: the quotas that bind it."""
     barred: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
-    """By owner: patterns of the RCs that no need of its ARCs is bound to."""
+    """By owner: patterns of RCs that its ARCs never get."""
     fair_shares: FairShares | None = None
-    """None: whose an ARC is does not count."""
+    """None: the order does not depend on owners."""
 
 
 DEFAULT: Final = SchedulingPolicy()

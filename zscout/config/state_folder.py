@@ -1,6 +1,6 @@
-"""Where a host keeps what must outlive its processes, by fleet and host.
+"""The folder for files that must outlive a host's processes, by fleet and host.
 
-That is the folder `state` of the node file; else `$STATE_DIRECTORY`, which systemd gives its units; else
+It is in the folder `state` of the node file; else `$STATE_DIRECTORY`, which systemd sets for its units; else
 `$XDG_STATE_HOME/zscout`, else `~/.local/state/zscout`."""
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ log = logging.getLogger(__name__)
 
 
 def state_folder(fleet: str, host: str, named: Path | None = None, env: Mapping[str, str] = os.environ) -> Path | None:
-    """The folder of one host of one fleet, made if need be. None, and a line in the log, where none can be written."""
+    """The folder of one host of one fleet, made if needed. None, with a line in the log, if it can't be written."""
     folder = _top(named, env)
     if folder is None:
-        log.warning("there is no folder for what must outlive this node: set `state` under [node], or $XDG_STATE_HOME")
+        log.warning("no folder for files that outlive this node: set `state` under [node], or $XDG_STATE_HOME")
         return None
     folder = folder / fleet / host
     try:
@@ -28,7 +28,7 @@ def state_folder(fleet: str, host: str, named: Path | None = None, env: Mapping[
         probe.touch()
         probe.unlink()
     except OSError as error:
-        log.warning("%s can't be written (%s): set `state` under [node] to a folder that can", folder, error.strerror)
+        log.warning("can't write %s (%s): set `state` under [node] to another folder", folder, error.strerror)
         return None
     return folder
 
@@ -40,14 +40,14 @@ def _top(named: Path | None, env: Mapping[str, str]) -> Path | None:
         return Path(given.split(":")[0])
     if given := env.get("XDG_STATE_HOME"):
         return Path(given) / "zscout"
-    with suppress(RuntimeError):  # nobody's home is known
+    with suppress(RuntimeError):  # this user has no home
         return Path.home() / ".local" / "state" / "zscout"
     return None
 
 
 def write_durably(path: Path, content: bytes, mode: int | None = None) -> None:
-    """Writes a file whole or not at all; it is on disk on return. With `mode` a new file has this from the first
-    byte on, and one that was there keeps its own, and its owner. Raises OSError."""
+    """Write a file atomically; it is on disk on return. A new file has `mode` from its first byte on; with `mode`, a
+    replaced file keeps its mode and owner. Raises OSError."""
     path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
     new = path.with_name(f".{path.name}.new")
     new.unlink(missing_ok=True)

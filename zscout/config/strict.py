@@ -1,11 +1,11 @@
-"""Files that people write, read strictly: TOML in, typed structs out, or one line that says what to mend.
+"""Strict reading of files that people write: TOML in; typed structs, or a one-line error, out.
 
-Every error is a `BadInput` of the form `FILE: KEY.PATH: what is wrong; remedy`. Keys are written as in TOML,
-items of a list are counted from 0, and the item's own name follows in brackets where it has one:
+Every error is a `BadInput` of the form `FILE: KEY.PATH: fault; remedy`. Keys are written as in TOML, items of a list
+are counted from 0, and an item's name follows in brackets:
 `lab.toml: rc[2].driver (robot/scout33): is the text "fast"; write "exclusive" or "capacity"`.
 
-msgspec converts, but it names no keys of a table (`$.needs[...]`), hints at no unknown key, takes a text for a Decimal
-and makes 1e400 infinite. So the data is checked here first, along the same types."""
+msgspec converts the data, but its errors do not name keys of tables (`$.needs[...]`) or suggest known keys, it accepts
+a text for a Decimal, and it makes 1e400 infinite. So the data is checked here first, along the same types."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ from zscout.keyexpr import MAX_NAME, NAME
 T = TypeVar("T")
 
 MAX_SECONDS: Final = Decimal(1_000_000_000)
-"""Longest time a file may give, about 31 years; whole ns stay within 63 bits."""
+"""Longest duration in a file, about 31 years; whole ns stay within 63 bits."""
 _MAX_MAGNITUDE: Final = 18
-"""Largest power of ten of any number, and of any whole number; more would make exact sums slow."""
+"""Numbers are below this power of ten, so that exact sums stay fast."""
 _MAX_PLACES: Final = 100
 _MAX_SHOWN: Final = 60
 _MAX_DEPTH: Final = 32
@@ -40,7 +40,7 @@ _BARE_KEY: Final = re.compile(rf"[A-Za-z0-9_-]{{1,{_MAX_SHOWN}}}")
 _AT: Final = re.compile(r"(.*?) \(at (?:line (\d+), column (\d+)|end of document)\)", re.DOTALL)
 _PART: Final = r"""(?:[\w-]++|"(?:[^"\\\n]|\\.)*+"|'[^'\n]*+')"""
 _DEEP_KEY: Final = re.compile(rf"""(?<![\w"'\\-]){_PART}(?:[ \t]*+\.[ \t]*+{_PART}){{{_MAX_DEPTH}}}""")
-"""A dotted key that is longer than any here. tomllib takes hours over one that fills the file."""
+"""A dotted key longer than any valid key. tomllib takes hours over a key that fills the file."""
 _NUMBER: Final = r"([0-9]{1,19}(?:\.[0-9]{1,18})?|\.[0-9]{1,18})"
 _DURATION: Final = re.compile(
     f"{_NUMBER}|(?:{_NUMBER} ?d ?)?(?:{_NUMBER} ?h ?)?(?:{_NUMBER} ?m(?:in|(?!s)) ?)?(?:{_NUMBER} ?s ?)?"
@@ -48,19 +48,19 @@ _DURATION: Final = re.compile(
 )
 _UNITS: Final = tuple(map(Decimal, ("1", "86400", "3600", "60", "1", "0.001")))
 DURATIONS: Final = "a number of seconds, or with units: 1.5, 300ms, 90s, 5m, 2h, 1d12h"
-"""How people write durations."""
+"""Forms of a duration, for errors."""
 _NAME_RULE: Final = f'1 to {MAX_NAME} letters A to Z, digits, "_", "." or "-"'
 
 
 class BadInput(Exception):
-    """What a person gave can't be used. One line: what, where, how to mend it; the CLI exits with 2."""
+    """Invalid input of a person. One line: place, fault and remedy. The CLI exits with 2."""
 
     def __init__(self, line: str) -> None:
         super().__init__(_one_line(line))
 
 
 class Where(NamedTuple):
-    """A place in a file. `where / "key"` and `where.item(2, "its name")` go deeper."""
+    """A place in a file. `where / "key"` and `where.item(2, "its name")` are places below it."""
 
     source: str
     path: tuple[str | int, ...] = ()
@@ -70,7 +70,7 @@ class Where(NamedTuple):
         return Where(self.source, (*self.path, key), self.item_name)
 
     def item(self, number: int, name: object = "") -> Where:
-        """An item of a list, counted from 0; `name` is shown beside it if it is a text."""
+        """An item of a list, counted from 0; its `name` is shown if it is a text."""
         return Where(self.source, (*self.path, number), name if isinstance(name, str) else self.item_name)
 
     @property
@@ -80,7 +80,7 @@ class Where(NamedTuple):
         return "".join(f"[{step}]" if isinstance(step, int) else f".{step}" for step in steps).removeprefix(".")
 
     def bad(self, what: str, remedy: str) -> BadInput:
-        """The error to raise about this place."""
+        """The error about this place."""
         key = self.key
         if self.item_name and self.path[-1] != "name":
             key += f" ({_short(self.item_name)})"
@@ -88,16 +88,16 @@ class Where(NamedTuple):
 
 
 def quoted(text: str) -> str:
-    """A text as an error shows it: in quotes, on one line, cut where it is long."""
+    """A text for an error: in quotes, on one line, shortened."""
     escaped = _short(text).replace("\\", "\\\\").replace('"', '\\"')
     return f'"{_one_line(escaped)}"'
 
 
 def read_bytes(path: Path, *, max_bytes: int) -> bytes:
-    """What is in a regular file of at most `max_bytes` bytes. Raises BadInput."""
+    """The content of a regular file of at most `max_bytes` bytes. Raises BadInput."""
     where = Where(str(path))
     try:
-        # O_NONBLOCK: a FIFO without a writer would block here for ever.
+        # O_NONBLOCK: a FIFO without a writer would block forever.
         fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
         with open(fd, "rb") as file:  # noqa: PTH123 - a descriptor
             if not stat.S_ISREG(os.fstat(fd).st_mode):
@@ -129,15 +129,15 @@ def read_text(path: Path, *, max_bytes: int) -> str:
 
 
 def read_toml(path: Path, type: type[T], *, max_bytes: int = 1_000_000) -> T:  # noqa: A002 - msgspec's word
-    """Reads a TOML file of at most `max_bytes` bytes into a struct type. Raises BadInput."""
+    """Read a TOML file of at most `max_bytes` bytes into a struct type. Raises BadInput."""
     return parse_toml(read_text(path, max_bytes=max_bytes), str(path), type)
 
 
 def parse_toml(text: str, source: str, type: type[T]) -> T:  # noqa: A002 - msgspec's word
-    """Reads TOML into a struct type; `source` names the file in errors. Raises BadInput.
+    """Read TOML into a struct type; `source` names the file in errors. Raises BadInput, also for unknown keys.
 
-    Numbers with a point are read as Decimal, exactly; struct fields may be Decimal, float, int, str, bool,
-    Literal, lists and tables of these, Any, structs and dataclasses. A key that they do not have is refused."""
+    Numbers with a point are read exactly, as Decimal. Struct fields may be Decimal, float, int, str, bool, Literal,
+    lists and tables of these, Any, structs and dataclasses."""
     where = Where(source)
     if deep := _DEEP_KEY.search(text):
         line = text.count("\n", 0, deep.start()) + 1
@@ -155,41 +155,41 @@ def parse_toml(text: str, source: str, type: type[T]) -> T:  # noqa: A002 - msgs
         raise BadInput(f"{source}: {place}: {what}; fix the TOML there or just before") from None
     except RecursionError:
         raise where.bad("is nested too deep", "use fewer levels") from None
-    except ValueError:  # Python's limit of digits, the only one that tomllib does not turn into its own error
+    except ValueError:  # Python's limit of digits, which tomllib does not turn into its own error
         raise where.bad("a whole number has thousands of digits", "shorten it") from None
     return convert(data, type, where)
 
 
 def convert(data: object, type: type[T], where: Where) -> T:  # noqa: A002 - msgspec's word
-    """What TOML or JSON gave, as a struct or dataclass. Raises BadInput, TypeError for a type that is none of these."""
+    """Convert parsed TOML or JSON into a struct or dataclass. Raises BadInput, TypeError for an unsupported type."""
     kind: Any = type
     try:
         return msgspec.convert(_checked(_type_info(kind), data, where), type)
-    except msgspec.ValidationError as error:  # what only msgspec knows of, as other bounds than `key` gives
+    except msgspec.ValidationError as error:  # a check that only msgspec does, such as bounds not given by `key`
         raise where.bad(str(error), "correct it") from None
 
 
 @cache
 def _type_info(type: Any) -> inspect.Type:  # noqa: A002 - msgspec's word
-    # Some 10 ms for a type, and a node file converts each of its `[[rc]]` tables.
+    # Takes some 10 ms for a type, and a node file converts each of its `[[rc]]` tables.
     return inspect.type_info(type)
 
 
 def check_name(value: str, where: Where) -> None:
-    """Refuses a name that may not stand in a mesh key (`[A-Za-z0-9_.-]+`, at most 64). Raises BadInput."""
+    """Raises BadInput for a name that is not valid in a mesh key (`[A-Za-z0-9_.-]+`, at most 64)."""
     if not NAME.fullmatch(value):
         raise where.bad(f"{quoted(value)} is not a name", f"write {_NAME_RULE}")
 
 
 def check_folder_name(value: str, where: Where) -> None:
-    """The same for a name that is a folder's as well: of dots alone it is the folder itself or the one above."""
+    """`check_name` for a name that is also a folder's: "." and ".." would be the folder itself and its parent."""
     check_name(value, where)
     if not value.strip("."):
         raise where.bad(f"{quoted(value)} can't be a folder's name", "use a letter or a digit")
 
 
 def check_rc_name(value: str, where: Where, of: str = "") -> None:
-    """Refuses what is not `kind/name`, both names by themselves, and of kind `of` if given. Raises BadInput."""
+    """Raises BadInput unless `value` is `kind/name`, both valid names, and of kind `of` if given."""
     kind, _, name = value.partition("/")
     if not (NAME.fullmatch(kind) and NAME.fullmatch(name)):
         remedy = f'write kind/name, as in "robot/scout33", each of {_NAME_RULE}'
@@ -199,14 +199,14 @@ def check_rc_name(value: str, where: Where, of: str = "") -> None:
 
 
 def check_names(values: Iterable[str], where: Where) -> None:
-    """The same for each of a list, none of which stands twice. Raises BadInput."""
+    """`check_name` for a list without duplicates."""
     for number, value in enumerate(values):
         check_name(value, where.item(number))
     check_unique(values, where)
 
 
 def check_unique(values: Iterable[str], where: Where, key: str = "") -> None:
-    """Refuses a value that stands twice in a list (of texts, or of tables with `key`). Raises BadInput."""
+    """Raises BadInput for duplicates in a list (of texts, or of the key `key` in tables)."""
     first: dict[str, int] = {}
     for number, value in enumerate(values):
         earlier = first.setdefault(value, number)
@@ -217,7 +217,7 @@ def check_unique(values: Iterable[str], where: Where, key: str = "") -> None:
 
 
 def seconds_to_ns(value: Decimal, where: Where, *, low: Decimal = Decimal(0), high: Decimal = MAX_SECONDS) -> int:
-    """Seconds as whole nanoseconds, halves to even; refused outside `low`..`high` s. Raises BadInput."""
+    """Convert seconds to whole nanoseconds, halves to even. Raises BadInput outside `low`..`high` s."""
     if not (value.is_finite() and low <= value <= high):
         raise where.bad(f"is {value} s", f"write {low:f} to {high:f} seconds")
     return round(Fraction(value) * 1_000_000_000)
@@ -233,8 +233,8 @@ def key(
     most: int | None = None,
     remedy: str = "",
 ) -> Meta:
-    """What the reference says of a key, and its bounds, as metadata of a struct's field. `most` is the number
-    of its entries at most; `remedy` is what an error says where a required key is missing."""
+    """Description and bounds of a key, as metadata of a struct's field. `most`: greatest number of entries; `remedy`:
+    remedy in the error if a required key is missing."""
     extra = {name: text for name, text in (("unit", unit), ("remedy", remedy)) if text}
     bounds: dict[str, Any] = {"ge": low, "le": high, "max_length": most}
     examples = None if example is None else [example]
@@ -242,12 +242,12 @@ def key(
 
 
 def secret(wanted: str) -> Meta:
-    """Marks what no error may show. `wanted` is what it says instead: what is to be written."""
+    """Mark a key whose value errors must not show. `wanted`: the expected form, for the remedy."""
     return Meta(extra={"secret": wanted})
 
 
 def parse_duration(text: str) -> Decimal | None:
-    """Seconds from `5`, `1.5`, `90s`, `300ms`, `5m`, `2h`, `1d12h` or as messages write it, `1 min 30 s`; else None."""
+    """Seconds from `5`, `1.5`, `90s`, `300ms`, `5m`, `2h`, `1d12h`, or `1 min 30 s` as in messages; else None."""
     found = _DURATION.fullmatch(text)
     if found is None or not any(found.groups()):
         return None
@@ -255,13 +255,13 @@ def parse_duration(text: str) -> Decimal | None:
 
 
 def seconds(low: str, high: str, description: str) -> Meta:
-    """The same for a duration: written in seconds or as `parse_duration` has it, held as whole nanoseconds."""
+    """Description and bounds (in s) of a duration, written as for `parse_duration` and converted to whole ns."""
     return Meta(description=description, extra={"unit": "s", "low": Decimal(low), "high": Decimal(high)})
 
 
 def amounts(values: Mapping[str, Decimal], where: Where) -> dict[str, Fraction]:
-    """Bandwidth parameters or capacities without any loss, so that 0.1 + 0.2 is 0.3; a negative one is
-    refused. Raises BadInput."""
+    """Convert bandwidth parameters or capacities exactly, so that 0.1 + 0.2 is 0.3. Raises BadInput for a negative
+    value."""
     for name, value in values.items():
         if value < 0:
             raise (where / name).bad(f"is {value}", "write 0 or more")
@@ -271,7 +271,7 @@ def amounts(values: Mapping[str, Decimal], where: Where) -> dict[str, Fraction]:
 def _decimal(text: str) -> Decimal:
     try:
         return Decimal(text)
-    except InvalidOperation:  # an exponent beyond what Decimal holds; refused below, with its key
+    except InvalidOperation:  # an exponent too large for Decimal; `_check_leaf` refuses infinity
         return Decimal("Infinity")
 
 
@@ -282,11 +282,11 @@ _LEAVES: Final[Mapping[type[inspect.Type], tuple[tuple[type, ...], str]]] = {
     inspect.StrType: ((str,), "a text in quotes"),
     inspect.BoolType: ((bool,), "true or false"),
 }
-"""What TOML, or JSON, gives for a type, and how people call that."""
+"""By type of a field: the accepted Python types of parsed TOML or JSON, and their name in errors."""
 
 
 def _checked(kind: inspect.Type, value: object, where: Where) -> object:
-    """`value`, as TOML gave it, with durations in ns. Raises BadInput where it is not of this kind."""
+    """Check parsed TOML against a type; return it with durations in ns. Raises BadInput."""
     match kind:
         case inspect.Metadata(extra={"low": low, "high": high}):
             value = _seconds(value, where)
@@ -311,7 +311,7 @@ def _checked(kind: inspect.Type, value: object, where: Where) -> object:
         case inspect.UnionType(types=kinds):  # else only X | None: absent in TOML, or X
             kind, *others = (kind for kind in kinds if not isinstance(kind, inspect.NoneType))
             if others:
-                raise TypeError(f"{where.key} may be of several types, which no file can be read into")
+                raise TypeError(f"{where.key} has several types, which is not supported")
             return _checked(kind, value, where)
         case inspect.StructType() | inspect.DataclassType():
             wanted = "a table" if where.key.endswith("]") else f"a table, under [{where.key}]"
@@ -336,7 +336,7 @@ def _checked(kind: inspect.Type, value: object, where: Where) -> object:
 
 
 def _seconds(value: object, where: Where) -> object:
-    """A duration that is written as a text, in seconds; all else as it is."""
+    """Parse a duration given as text into seconds; return any other value unchanged."""
     if not isinstance(value, str):
         return value
     found = parse_duration(value)
@@ -346,15 +346,15 @@ def _seconds(value: object, where: Where) -> object:
 
 
 def _tagged(structs: Iterable[inspect.Type], table: Mapping[str, object], where: Where) -> inspect.StructType:
-    """The struct that the table's tag names."""
-    known = {str(one.tag): one for one in structs if isinstance(one, inspect.StructType)}
+    """Select the struct by the table's tag."""
+    known = {str(struct.tag): struct for struct in structs if isinstance(struct, inspect.StructType)}
     tag_field = str(next(iter(known.values())).tag_field)
     if tag_field not in table:
         raise (where / tag_field).bad("is missing", "add it")
     tag = table[tag_field]
     _check_choice(sorted(known), tag, where / tag_field)
     for key in table:
-        others = [name for name, one in known.items() if any(key == field.encode_name for field in one.fields)]
+        others = [name for name, struct in known.items() if any(key == field.encode_name for field in struct.fields)]
         if others and tag not in others:
             raise (where / key).bad(
                 f"{tag_field} {quoted(str(tag))} does not take it",
@@ -385,7 +385,7 @@ def _checked_struct(
 
 
 def _expect(types: type | tuple[type, ...], value: object, where: Where, wanted: str) -> Any:
-    # bool is an int to Python, and is none to whoever writes a file.
+    # bool is an int in Python, but not to the author of a file.
     if not isinstance(value, types) or (isinstance(value, bool) and types != (bool,)):
         raise where.bad(f"is {_shown(value)}", f"write {wanted}")
     return value
@@ -397,16 +397,16 @@ def _check_count(count: int, most: int | None, where: Where) -> None:
 
 
 def _check_choice(values: Iterable[object], value: object, where: Where) -> None:
-    # 1 == True, and is another value to whoever writes a file.
-    if not any(value == one and type(value) is type(one) for one in values):
-        words = [str(one).lower() if isinstance(one, bool) else quoted(str(one)) for one in values]
+    # 1 == True in Python, but not to the author of a file.
+    if not any(value == choice and type(value) is type(choice) for choice in values):
+        words = [str(choice).lower() if isinstance(choice, bool) else quoted(str(choice)) for choice in values]
         raise where.bad(f"is {_shown(value)}", f"write {_either(words)}")
 
 
 def _check_leaf(kind: inspect.Type, value: object, where: Where) -> None:
-    """Beyond the type and the bounds, refuses NaN, infinities and what is unreasonably long when exact."""
+    """Check type and bounds; refuse NaN, infinities and numbers with too many digits. Raises BadInput."""
     if type(kind) not in _LEAVES:
-        raise TypeError(f"{where.key} has a type that no file can be read into: {kind}")
+        raise TypeError(f"{where.key} has an unsupported type: {kind}")
     types, wanted = _LEAVES[type(kind)]
     low, high = getattr(kind, "ge", None), getattr(kind, "le", None)
     if low is not None and high is not None:
@@ -454,5 +454,5 @@ def _short(text: str) -> str:
 
 
 def _one_line(text: str) -> str:
-    """Control characters, line ends and stray bytes escaped: a hostile file can't draw on the terminal."""
+    """Escape control characters, line ends and stray bytes, so that a hostile file can't draw on the terminal."""
     return "".join(char if char.isprintable() else char.encode("unicode_escape").decode() for char in text)

@@ -83,7 +83,9 @@ class Authority:
             raise self._refused(name, f"request {asked.min_runtime / SECOND:g} s; at most {longest / SECOND:g}")
         for need in asked.needs:
             if not is_pattern(need) and not self.may_hold(name, need):
-                raise Refused("not_allowed", self._policy.told(name, f"hold {need}", self._policy.holders(need) or ()))
+                raise Refused(
+                    "not_allowed", self._policy.refusal_text(name, f"hold {need}", self._policy.holders(need) or ())
+                )
         for owner, members, quota in self._policy.quotas_of(asked.charged_to or name):
             if quota.rcs is not None and len(asked.needs) > quota.rcs:
                 raise Refused(
@@ -199,4 +201,4 @@ class Authority:
     def _refused(self, name: str, what: str) -> Refused:
         """Of what operators may."""
         could = [one for one, ranks in self._policy.ranks.items() if "operator" in ranks]
-        return Refused("not_allowed", self._policy.told(name, what, could))
+        return Refused("not_allowed", self._policy.refusal_text(name, what, could))

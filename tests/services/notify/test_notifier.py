@@ -64,9 +64,9 @@ async def test_apprise_that_hangs_is_ended(monkeypatch: pytest.MonkeyPatch, capl
     await asyncio.to_thread(telling._waiting.join)
     telling.stop()
     assert [record.getMessage() for record in caplog.records] == [
-        "notify.urls[0] was not told, in 3 attempts: Apprise has not ended within 0.001 s"
+        "notify.urls[0] was not told, in 3 attempts: Apprise did not end within 0.001 s"
     ]
-    with pytest.raises(BadInput, match=r"notify: can't be checked: Apprise has not ended within 0\.001 s; try "):
+    with pytest.raises(BadInput, match=r"notify: can't be checked: Apprise did not end within 0\.001 s; try "):
         notifier(NotifyTable(("json://localhost",)))
 
 

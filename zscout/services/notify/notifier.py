@@ -9,7 +9,7 @@ import threading
 from collections.abc import Callable, Iterable, Sequence
 from typing import Final
 
-from zscout.config.apprise_process import NoAnswer, sent
+from zscout.config.apprise_process import NoAnswer, send
 from zscout.config.notify import Address, NotifyConfig
 from zscout.mesh.sparse_log import SparseLog
 from zscout.mesh.supervision import Supervisor, clock
@@ -121,7 +121,7 @@ class Notifier:
     def _attempt(self, address: Address, notification: Notification) -> str:
         """Why it failed; empty: it did not."""
         try:
-            taken = sent(address.url, notification.title, notification.body)
+            taken = send(address.url, notification.title, notification.body)
         except NoAnswer as error:
             return str(error)
         return "" if taken else "it did not take it"
