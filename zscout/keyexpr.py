@@ -1,7 +1,7 @@
 """The key space: every key expression of zscout is built and parsed here, and nowhere else.
 
-All keys lie under `zscout/<fleet>`. The sender of a request stands in its key, so that access control can check it; a
-receiver reads it from there and refuses wildcards in its place."""
+All keys begin with `zscout/<fleet>`. The key of a request contains its sender, so that access control can check it; the
+receiver reads the sender from the key and refuses wildcards there."""
 
 from __future__ import annotations
 
@@ -15,34 +15,34 @@ from typing import Any, Final, Literal, NamedTuple, TypeAlias
 
 MAX_NAME = 64
 NAME = re.compile(rf"[A-Za-z0-9_.-]{{1,{MAX_NAME}}}")
-# A whole name; or parts of one and stars between them, no two stars together and not a star alone.
+# `*`, or a name with `$*` for any part; not two stars in a row, and not `$*` alone.
 _CHUNK = rf"(?:\*|(?![^/#]*\$\*\$)(?!\$\*(?:[/#]|\Z))(?:[A-Za-z0-9_.-]|\$\*){{1,{MAX_NAME}}})"
 _PATTERN = re.compile(rf"{_CHUNK}/{_CHUNK}(?:#[1-9][0-9]?)?")
 ROOT = "zscout"
 MAX_DIGITS = 19
 """Of an incarnation."""
-REMEMBERED = 4_096
+CACHED_NAMES = 4_096
 """Valid names that are not checked again."""
 
 
 class BadName(ValueError):
-    """A name or a key that can't stand in the key space; the message says which and why."""
+    """A name or key that is not valid in the key space; the message has the name and the rule."""
 
 
 def _quoted(text: str) -> str:
     return '"{}"'.format(repr(text[:130])[1:-1].replace("\\'", "'").replace('"', '\\"'))
 
 
-@lru_cache(REMEMBERED)
+@lru_cache(CACHED_NAMES)
 def check_name(name: str, what: str = "name") -> str:
-    """`name` itself if it may stand in a key; raises BadName otherwise."""
+    """Return `name` if it is valid in a key. Raises BadName."""
     if NAME.fullmatch(name) is None:
         raise BadName(f"{what} {_quoted(name)} is not valid; use 1 to 64 of A-Z a-z 0-9 _ . -")
     return name
 
 
 def check_new_name(name: str, what: str) -> str:
-    """The same of a name that somebody gives; the error proposes a valid one, as `test_gpu-0` for `test_gpu[0]`."""
+    """`check_name` for a name that a person gave: the error suggests a valid name, `test_gpu-0` for `test_gpu[0]`."""
     try:
         return check_name(name, what)
     except BadName as error:
@@ -50,9 +50,9 @@ def check_new_name(name: str, what: str) -> str:
         raise BadName(f"{error}, as in {near}" if re.search("[A-Za-z0-9]", near) and name else str(error)) from None
 
 
-@lru_cache(REMEMBERED)
+@lru_cache(CACHED_NAMES)
 def check_rc(name: str) -> str:
-    """`kind/name` itself if it names an RC; raises BadName otherwise."""
+    """Return `name` if it is a valid `kind/name` of an RC. Raises BadName."""
     kind, slash, rest = name.partition("/")
     if not slash:
         raise BadName(f"device {_quoted(name)} is not valid; write kind/name, as in robot/scout33")
@@ -62,14 +62,14 @@ def check_rc(name: str) -> str:
 
 
 def is_pattern(need: str) -> bool:
-    """Whether a need is met by any RC whose name matches, not by one that it names."""
+    """Return True if a need is a pattern of RC names, not a name."""
     return "*" in need
 
 
-@lru_cache(REMEMBERED)
+@lru_cache(CACHED_NAMES)
 def check_need(need: str) -> str:
-    """`need` itself if it names an RC or is a pattern: `kind/name` with `*` or `$*` in it, and `#2`, `#3` and
-    so on behind it where one ARC needs several by one pattern. Raises BadName otherwise."""
+    """Return `need` if it names an RC or is a pattern: `kind/name` with `*` or `$*` in it, followed by `#2`, `#3` and
+    so on for further RCs by the same pattern in an ARC. Raises BadName."""
     if not is_pattern(need):
         return check_rc(need)
     if _PATTERN.fullmatch(need) is None:
@@ -81,7 +81,7 @@ def check_need(need: str) -> str:
 
 
 def of_host(host: str) -> str:
-    """All RCs of a host, as maintenance names them: `@anvil`."""
+    """Name of all RCs of a host, for maintenance: `@anvil`."""
     return f"@{host}"
 
 
@@ -90,19 +90,19 @@ def host_in(need: str) -> str | None:
     return need[1:] if need.startswith("@") else None
 
 
-@lru_cache(REMEMBERED)
+@lru_cache(CACHED_NAMES)
 def check_maintained(need: str) -> str:
-    """`need` itself if maintenance may name it: an RC, a pattern for all RCs that match it, or `@<host>` for all RCs of
-    a host. Raises BadName otherwise."""
+    """Return `need` if it is valid for maintenance: an RC, a pattern for all matching RCs, or `@<host>` for all RCs of
+    a host. Raises BadName."""
     if (host := host_in(need)) is None:
         return check_need(need)
     check_name(host, "host")
     return need
 
 
-@lru_cache(REMEMBERED)
+@lru_cache(CACHED_NAMES)
 def matcher(need: str) -> Callable[[str], bool]:
-    """A test of RC names for a pattern, which matches as Zenoh's key expressions do."""
+    """Return a test of RC names against a pattern, with the semantics of Zenoh's key expressions."""
     kind, _, name = need.partition("#")[0].partition("/")
 
     def matches(rc: str) -> bool:
@@ -113,7 +113,7 @@ def matcher(need: str) -> Callable[[str], bool]:
 
 
 def _matches(pattern: str, name: str) -> bool:
-    """One chunk. No regular expression: with many stars one can take for ever."""
+    """Match a single chunk. Not by a regular expression, whose time grows exponentially with many stars."""
     if "/" in name or not name:
         return False
     if pattern == "*" or "*" not in pattern:
@@ -121,7 +121,7 @@ def _matches(pattern: str, name: str) -> bool:
     first, *middle, last = pattern.split("$*")
     if len(name) < len(first) + len(last) or not name.startswith(first) or not name.endswith(last):
         return False
-    # The leftmost place of each part leaves most for the others.
+    # Matching each part as far left as possible leaves most room for the rest.
     at, end = len(first), len(name) - len(last)
     for part in middle:
         at = name.find(part, at, end)
@@ -132,21 +132,21 @@ def _matches(pattern: str, name: str) -> bool:
 
 
 def valid_name(text: str) -> str:
-    """`text` made a valid name, for host names and the like; empty input gives "unnamed"."""
+    """Turn a text, such as a hostname, into a valid name; "unnamed" if it is empty."""
     return re.sub(r"[^A-Za-z0-9_.-]", "-", text)[:64] or "unnamed"
 
 
 RANDOM: Final[ContextVar[random.Random]] = ContextVar("RANDOM", default=random.SystemRandom())  # noqa: B039
-"""Where names, pauses and lots come from: the system's, or, for each process of a simulation, one of its seed."""
+"""Source of random names, pauses and lots: the system's, or in a simulation a seeded source for each process."""
 
 
 def new_instance() -> str:
-    """A name for one life of a process or an RC: two holders of one liveliness key would hide each other."""
+    """A random name for this run of a process or RC: two owners of the same liveliness key would hide each other."""
     return f"{RANDOM.get().getrandbits(48):012x}"
 
 
 def incarnation_of(instance: str) -> int:
-    """Which start of a component its token stands for: `<incarnation>-<any>`. Raises BadName."""
+    """The incarnation in the instance of a component's token: `<incarnation>-<any>`. Raises BadName."""
     number = instance.partition("-")[0]
     if not (number.isascii() and number.isdigit() and len(number) <= MAX_DIGITS and int(number) > 0):
         raise BadName(f"{_quoted(instance)} does not begin with an incarnation")
@@ -164,7 +164,7 @@ class Sender(NamedTuple):
 
 
 class Token(NamedTuple):
-    """A liveliness token: what is alive. `name` is `kind/name` for an RC."""
+    """A liveliness token. `name` is `kind/name` for an RC."""
 
     host: str
     role: str
@@ -184,11 +184,11 @@ class Role:
     RECORDER = "recorder"
     COMPONENT = "component"
     SESSION = "session"
-    """A session of the process: `instance` is its id in the network below."""
+    """A Zenoh session of a process: `instance` is its Zenoh id."""
 
 
 class _Key:
-    """A key expression of the fleet that needs nothing but the fleet's name."""
+    """A key expression that depends only on the fleet's name."""
 
     def __init__(self, suffix: str) -> None:
         self._suffix = suffix
@@ -198,7 +198,7 @@ class _Key:
 
 
 def _rc_key(suffix: str) -> Callable[[Keys, str], str]:
-    """A method of Keys: the key of an RC."""
+    """A method of Keys that returns a key of an RC."""
     return lambda self, rc: f"{self.base}/rc/{check_rc(rc)}/{suffix}"
 
 
@@ -219,7 +219,7 @@ class Keys:
 
     fleet: str
     closed: bool = False
-    """Whether the fleet has certificates: then every question names its sender."""
+    """True if the fleet has certificates: then the key of every query contains its sender."""
 
     everything = _Key("**")
     schedule_any = _Key("rcm/schedule/*/*")
@@ -270,34 +270,34 @@ class Keys:
         return f"{self.base}/rc/{check_rc(rc)}/command/{_sender(sender)}"
 
     def confirm(self, host: str, sender: Sender) -> str:
-        """Where all RCs of a host's processes are asked at once whether they know of a grant."""
+        """Key to ask all RCs of a host at once whether they know a grant."""
         return f"{self.base}/host/{check_name(host, 'host')}/confirm/{_sender(sender)}"
 
     def history(self, host: str, sender: Sender) -> str:
-        """Where a candidate is asked for what its journal keeps."""
+        """Key to query a candidate's journal."""
         return f"{self.base}/host/{check_name(host, 'host')}/history/{_sender(sender)}"
 
     def placer(self, sender: Sender) -> str:
-        """Where the component placer is asked."""
+        """Key of requests to the component placer."""
         return self._asked("placer/component", sender)
 
     def component(self, host: str, sender: Sender) -> str:
-        """Where the node of a host is asked about its components."""
+        """Key of requests to a host's node about its components."""
         return self._asked(f"host/{check_name(host, 'host')}/component", sender)
 
     def component_any(self, sender: Sender) -> str:
         return self._asked("host/*/component", sender)
 
     def _asked(self, key: str, sender: Sender) -> str:
-        # Who is older than certificates serves the key without a sender alone.
+        # Versions before certificates serve only the key without a sender.
         return f"{self.base}/{key}/{_sender(sender)}" if self.closed else f"{self.base}/{key}"
 
     def ask_state(self, sender: Sender) -> str:
-        """Where the leader is asked for the state. RCs, candidates and others of a node ask on `rcm_state`."""
+        """Key to query the leader's state; nodes, with their RCs and candidates, use `rcm_state`."""
         return self._asked("rcm/state", sender)
 
     def ask_rc_state(self, rc: str, sender: Sender) -> str:
-        """Where people ask an RC for its state; leaders ask on `rc_state`, also for a promise."""
+        """Key for people to query an RC's state; leaders use `rc_state`, also for a promise."""
         return f"{self.rc_state(rc)}/{_sender(sender)}" if self.closed else self.rc_state(rc)
 
     def ask_bookings(self, sender: Sender) -> str:
@@ -334,13 +334,13 @@ class Keys:
         return f"{self.base}/alive/{program.host}/{Role.SESSION}/{program.client}/*"
 
     def alive_any(self, role: str = "*") -> str:
-        """Tokens of a role, or of all."""
+        """Tokens of a role; "*": of all roles."""
         return f"{self.base}/alive/*/{role}/**" if role != "*" else f"{self.base}/alive/**"
 
-    # Parsing: each raises BadName for a key of another form
+    # Parsing: each method raises BadName for a key of another form
 
     def sender_of(self, key: str) -> Sender:
-        """The sender of a request or command, or the owner of the key of a client, recorder or building."""
+        """The sender of a request or command, or the owner of a client's, recorder's or building's key."""
         return _sender_of(self, key)
 
     def rc_of(self, key: str) -> str:
@@ -372,7 +372,7 @@ class Keys:
         return key[len(self.base) + 1 :].split("/")
 
 
-@lru_cache(REMEMBERED)
+@lru_cache(CACHED_NAMES)
 def _sender_of(keys: Keys, key: str) -> Sender:
     match keys._chunks(key):
         case (
@@ -390,7 +390,7 @@ def _sender_of(keys: Keys, key: str) -> Sender:
 
 
 def client_of(text: str) -> Sender:
-    """`<host>/<client>` as messages carry it; raises BadName for anything else."""
+    """Parse `<host>/<client>` from a message. Raises BadName."""
     host, _, client = text.partition("/")
     return Sender(check_name(host, "host"), check_name(client, "client"))
 
@@ -399,31 +399,31 @@ def _sender(sender: Sender) -> str:
     return f"{check_name(sender.host, 'host')}/{check_name(sender.client, 'client')}"
 
 
-# Access: what each role may send on each key. The `<host>` in a sender's keys is the name of its certificate
+# Access: the messages that each role may send on each key. `<host>` in a sender's key is the name of its certificate
 
 Rank: TypeAlias = Literal["viewer", "client", "operator", "node", "manager", "relay"]
-"""What a name may do in a fleet. A manager is a node that may lead."""
+"""The role of a name in a fleet. A manager is a node that may lead."""
 PEOPLE: Final[frozenset[Rank]] = frozenset({"viewer", "client", "operator"})
 MACHINES: Final[frozenset[Rank]] = frozenset({"node", "manager", "relay"})
 _ALL: Final[frozenset[Rank]] = frozenset({"viewer", "client", "operator", "node", "manager"})
 USERS: Final = _ALL - {"viewer"}
-"""Whose programs may hold RCs."""
+"""Ranks whose programs may hold RCs."""
 NODES: Final[frozenset[Rank]] = frozenset({"node", "manager"})
 _MANAGERS: Final[frozenset[Rank]] = frozenset({"manager"})
-_NOBODY: Final[frozenset[Rank]] = frozenset()
+_NO_RANK: Final[frozenset[Rank]] = frozenset()
 
 
 class Access(NamedTuple):
-    """One row of the key space. In `key` stands `{by}` for the name of who asks, `{at}` for that of who serves,
-    publishes or shows a token, `{rc}` for an RC that it may serve; to all others they are `*`."""
+    """The ranks that may use a key. In `key`, `{by}` is the asking name; `{at}` the name that serves, publishes or
+    shows a token; `{rc}` an RC that it may serve. In the rules of other names they are `*`."""
 
     key: str
-    ask: frozenset[Rank] = _NOBODY
-    serve: frozenset[Rank] = _NOBODY
-    publish: frozenset[Rank] = _NOBODY
-    subscribe: frozenset[Rank] = _NOBODY
-    show: frozenset[Rank] = _NOBODY
-    """A liveliness token."""
+    ask: frozenset[Rank] = _NO_RANK
+    serve: frozenset[Rank] = _NO_RANK
+    publish: frozenset[Rank] = _NO_RANK
+    subscribe: frozenset[Rank] = _NO_RANK
+    show: frozenset[Rank] = _NO_RANK
+    """Ranks that may declare a liveliness token."""
 
 
 ACCESS: Final = (
@@ -435,7 +435,7 @@ ACCESS: Final = (
     Access("rcm/bookings/{by}/*", ask=_ALL, serve=_MANAGERS),
     Access("rc/{rc}/vote", ask=_MANAGERS, serve=NODES),
     Access("rc/{rc}/command/{by}/*", ask=USERS, serve=NODES),
-    # Who asks may ask for a promise: a leader's right.
+    # This query can ask for a promise, which only leaders may do.
     Access("rc/{rc}/state", ask=_MANAGERS, serve=NODES, publish=NODES, subscribe=_ALL),
     Access("rc/{rc}/state/{by}/*", ask=_ALL, serve=NODES),
     Access("rc/{rc}/frame", publish=NODES, subscribe=_ALL),
@@ -459,7 +459,7 @@ ACCESS: Final = (
     *(Access(f"alive/{{at}}/{role}/**", show=_MANAGERS) for role in (Role.CANDIDATE, Role.RCM)),
     Access(f"alive/{{at}}/{Role.RC}/{{rc}}/*", show=NODES),
 )
-"""Every key of the fleet, with who may do what there. What keys can't tell is checked by who answers."""
+"""Every key of the fleet with its ranks. Rights that do not depend on the key alone are checked by the receiver."""
 
 _SENT: Final[dict[str, tuple[str, ...]]] = {
     "ask": ("query",),
@@ -472,7 +472,7 @@ _EVERYTHING: Final = [*(kind for kinds in _SENT.values() for kind in kinds), "de
 
 
 class FleetMember(NamedTuple):
-    """Somebody of a fleet: the name of a machine or a person, and the RCs, or patterns of RCs, that it may serve."""
+    """A machine or person of a fleet, and the RCs, or patterns of RCs, that it may serve."""
 
     name: str
     ranks: frozenset[Rank]
@@ -480,8 +480,8 @@ class FleetMember(NamedTuple):
 
 
 def access_control(keys: Keys, members: Collection[FleetMember]) -> dict[str, Any]:
-    """Zenoh's `access_control` for a session of this fleet: whoever has no certificate of a member's name may send
-    nothing, a member what its ranks say, under its own name. (Rules have no templates: each name has its own.)"""
+    """Zenoh's `access_control` for a session of this fleet: only members may send, under the name of their certificate
+    and as their ranks allow. Zenoh's rules have no templates, so each name has its own rules."""
     out = {"id": "out", "permission": "allow", "flows": ["egress"], "messages": _EVERYTHING}
     read = {"id": "read", "permission": "allow", "flows": ["ingress"], "messages": ["declare_subscriber"]}
     watch = {"id": "watch", "permission": "allow", "flows": ["ingress"], "messages": list(_READ)}
@@ -502,7 +502,7 @@ def access_control(keys: Keys, members: Collection[FleetMember]) -> dict[str, An
 def _rules(keys: Keys, member: FleetMember) -> Iterable[dict[str, Any]]:
     for act, kinds in _SENT.items():
         if "relay" in member.ranks:
-            # What others send comes to a site under the name of the relay, which checks it.
+            # Messages from other sites arrive under the name of the relay, which has checked them.
             found = [keys.everything]
         else:
             found = [
@@ -533,5 +533,5 @@ def _filled(key: str, *, by: str = "*", at: str = "*", rc: str = "*/*") -> str:
 
 
 def as_pattern(text: str) -> str:
-    """`kind/name` with `*` for any part of either, as a pattern of RCs (`robot/arm*` as `robot/arm$*`)."""
+    """Translate `*` for any part of a name into a pattern of RCs: `robot/arm*` to `robot/arm$*`."""
     return "/".join(chunk if chunk == "*" else chunk.replace("*", "$*") for chunk in text.split("/"))

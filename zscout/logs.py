@@ -1,4 +1,4 @@
-"""Logs of zscout's programs: one line for each record, whatever text from outside is in it."""
+"""Logs of zscout's programs: one line for each record, even with foreign text in it."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ REMEDIES: Final = {
 
 
 def shortage(error: BaseException | None) -> str:
-    """In words, what this host lacks for what has failed, or the name of a file that is no text, and the remedy; empty
-    for other errors, where the traceback may help."""
+    """Describe a shortage of this host (disk, memory, descriptors, ...) or a file name that is not UTF-8, with the
+    remedy. Return "" for other errors, whose traceback may help."""
     if isinstance(error, BaseExceptionGroup):
         return next(filter(None, map(shortage, error.exceptions)), "")
     if isinstance(error, UnicodeEncodeError) and "\udc80" <= error.object[error.start] <= "\udcff":
@@ -50,7 +50,7 @@ def shortage(error: BaseException | None) -> str:
 
 
 class LineFormatter(logging.Formatter):
-    """Control and bidi characters are left out; a traceback follows in indented lines, but not of a shortage."""
+    """Removes control and bidi characters. A traceback follows in indented lines, except for a shortage."""
 
     def formatMessage(self, record: logging.LogRecord) -> str:  # noqa: N802 - logging's name
         why = shortage(record.exc_info[1]) if record.exc_info else ""

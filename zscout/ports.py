@@ -1,4 +1,4 @@
-"""TCP ports for servers that are started next."""
+"""Free TCP ports for servers."""
 
 from __future__ import annotations
 
@@ -8,16 +8,16 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
-GIVEN_AWAY: Final = Path("/proc/sys/net/ipv4/ip_local_port_range")
-"""The ports that Linux gives to outgoing connections, and to servers that ask for any."""
+EPHEMERAL_PORTS: Final = Path("/proc/sys/net/ipv4/ip_local_port_range")
+"""The ports that Linux assigns to outgoing connections, and to servers that ask for any port."""
 LOWEST: Final = 10_000
 HIGHEST: Final = 32_768
 TRIES: Final = 100
 
 
 def free_port(bind: str, *ports: int) -> int:
-    """Return the first of these ports that is free on this IP address. 0 stands for any: a random port below those that
-    the system assigns to connections, so that it stays free until the server starts. Raises OSError."""
+    """Return the first free port among `ports` on this IP address. 0 is any port: a random port below the system's
+    ephemeral ports, which no connection takes before the server starts. Raises OSError."""
     error = OSError("no port was given")
     for port in ports:
         for number in [port] if port else [*_any(), 0]:
@@ -31,7 +31,7 @@ def free_port(bind: str, *ports: int) -> int:
 def _any() -> list[int]:
     highest = HIGHEST
     with suppress(OSError, ValueError, IndexError):
-        highest = int(GIVEN_AWAY.read_text().split()[0])
+        highest = int(EPHEMERAL_PORTS.read_text().split()[0])
     numbers = random.SystemRandom()
     return [numbers.randrange(LOWEST, highest) for _ in range(TRIES)] if highest > LOWEST else []
 

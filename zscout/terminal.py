@@ -1,6 +1,6 @@
-"""Output for people and programs: lines, JSON, tables, a bar, pictures in place; and keys that are typed.
+"""Terminal output (lines, JSON, tables, a progress bar, live pictures), and input of single keys.
 
-Rich is imported by the functions that need it: most of a short command's time is imports.
+Rich is imported in the functions that need it: imports take most of a short command's time.
 """
 
 from __future__ import annotations
@@ -32,67 +32,67 @@ if TYPE_CHECKING:
 GAP: Final = 2
 """Spaces between two columns."""
 INDENT: Final = 3
-"""Spaces before a line that stands beneath a row."""
-CUT: Final = 0.3
-"""Part of a terminal's width that a column keeps whose texts are shortened."""
-LISTED: Final = 0.4
-"""Part of a terminal's width that a column of lists or sentences should have before others are given up for it."""
+"""Spaces before a line below a row."""
+CUT_SHARE: Final = 0.3
+"""Share of the terminal's width for a column of shortened texts."""
+LIST_SHARE: Final = 0.4
+"""Least share of the terminal's width for a column of lists or sentences; other columns are removed to provide it."""
 WHOLE, ITEMS, WORDS = "(?!)", "\n", r"\n| (?!\()(?![^()]*\))"
-"""Where a cell may be broken: nowhere, between its items, between words that are not in parentheses."""
-NEAR: Final = 120.0
-"""Seconds from now within which a time of day is told with its seconds."""
-MAX_CLOCK: Final = 1e9
-"""Seconds from now that a time of day may be, either way."""
+"""Places where a cell may be broken: none, between its items, between words outside parentheses."""
+NEAR_S: Final = 120.0
+"""A time of day closer to now is shown with seconds."""
+MAX_CLOCK_S: Final = 1e9
+"""Greatest distance of a time of day from now."""
 MAX_TYPED: Final = 1_024
 KEYS: Final = re.compile(rb"\x1b[\[O].|.", re.DOTALL)
-"""The single keys of what was typed; an escape sequence is one key."""
+"""A single typed key; an escape sequence is a key."""
 
 _JSON: Final = msgspec.json.Encoder(decimal_format="number")
 
 
 def print_json(value: Any, stream: IO[str] | None = None) -> None:
-    """One JSON value (structs and Decimals included) on one line, at once; all in it that could draw is escaped."""
+    """Print a JSON value (also structs and Decimals) on one line and flush; control characters are escaped."""
     text = json_text(value)
-    # JSON is UTF-8, whatever the stream has, or ASCII.
+    # JSON must be UTF-8; a stream of another encoding gets ASCII.
     if not text.isascii() and (getattr(stream or sys.stdout, "encoding", None) or "utf-8").lower() != "utf-8":
         text = "".join(char if char.isascii() else escaped(char) for char in text)
     print_line(text, stream)
 
 
 def json_text(value: Any) -> str:
-    """The same as text."""
+    """The text that `print_json` prints."""
     try:
         text = _JSON.encode(value).decode()
-    except UnicodeEncodeError:  # the name of a file that is no text
+    except UnicodeEncodeError:  # a file name that is not UTF-8
         text = json.dumps(msgspec.to_builtins(value, builtin_types=(Decimal,)), default=float)
     return text if text.isprintable() else "".join(c if c.isprintable() else escaped(c) for c in text)
 
 
 def print_line(text: str, stream: IO[str] | None = None) -> None:
-    """One plain line, at once, so that a reader of the pipe sees it; unable to draw, whatever is in it."""
+    """Print a plain line without control characters and flush, so that a reader of the pipe sees it at once."""
     stream = stream or sys.stdout
     stream.write(clean(text) + "\n")
     stream.flush()
 
 
 def at_terminal(stream: IO[str] | None = None) -> bool:
-    """Whether people look at the stream (default stdout) and it can be drawn on."""
+    """Return True if the stream (default stdout) is a terminal that can draw."""
     return (stream or sys.stdout).isatty() and os.environ.get("TERM") != "dumb"
 
 
 def console(*, stderr: bool = False) -> Console:
-    """A Rich console without guesses: no markup, no highlighting; texts come from other hosts."""
+    """A Rich console without markup and highlighting, since texts come from other hosts."""
     from rich.console import Console
 
     return Console(stderr=stderr, markup=False, highlight=False, emoji=False)
 
 
 def clock(seconds: float, *, at_latest: bool = False) -> str:
-    """The time of day `seconds` from now, by this host's clock and zone: `14:32`, `14:32:05` within two minutes of now,
-    with the date on another day. What is cut off is rounded down, with `at_latest` up; negative: that long ago."""
+    """The time of day `seconds` from now (negative: ago) by this host's clock and zone: `14:32`, `14:32:05` within two
+    minutes of now, with the date on another day. Rounded down, with `at_latest` up."""
     now = datetime.now().astimezone()
-    at = (now + timedelta(seconds=max(-MAX_CLOCK, min(seconds, MAX_CLOCK)))).astimezone()
-    near = abs(seconds) < NEAR
+    at = (now + timedelta(seconds=max(-MAX_CLOCK_S, min(seconds, MAX_CLOCK_S)))).astimezone()
+    near = abs(seconds) < NEAR_S
     unit = timedelta(seconds=1) if near else timedelta(minutes=1)
     if at_latest and (rest := (at - datetime.min.replace(tzinfo=at.tzinfo)) % unit):
         at += unit - rest
@@ -108,18 +108,17 @@ def many(count: int, what: str) -> str:
 
 
 Line = tuple[str, str]
-"""One line at a terminal, and Rich's style for it."""
+"""A line at a terminal, and its Rich style."""
 
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """Rows of texts, made safe to print where they are. A newline in a cell stands for a space; a cell that has some is
-    broken over lines only there, any other at spaces.
+    """Rows of texts, with control characters removed on printing. A newline in a cell is printed as a space; a cell
+    with newlines is broken over lines only there, any other cell at spaces.
 
-    `styles` has Rich's style for each row. `spare` names the columns that a narrow terminal gives up, first things
-    first: those that are also in `beneath` get lines of their own below each row, the others are left out. Texts in the
-    columns `cut` are shortened before others are broken. Long words in the columns `fold` are broken, not shortened, so
-    that they can be copied."""
+    `styles`: the Rich style of each row. `spare`: columns to remove on a narrow terminal, in this order; columns that
+    are also in `beneath` move to lines below each row. Texts in the columns `cut` are shortened before others are
+    broken. Long words in the columns `fold` are broken, not shortened, so that people can copy them."""
 
     title: str
     columns: Sequence[str]
@@ -131,7 +130,7 @@ class Table:
     fold: Collection[str] = ()
 
     def lines(self) -> list[str]:
-        """Without colours, as wide as the texts are: two spaces between columns."""
+        """Plain lines, as wide as their texts, with two spaces between columns."""
         table = [self.columns, *([writable(clean(cell)) for cell in row] for row in self.rows)]
         widths = [max(map(len, column)) for column in zip(*table, strict=True)]
         lines = [
@@ -140,7 +139,7 @@ class Table:
         return [self.title, *lines] if self.title else lines
 
     def fitted(self, width: int, most: int | None = None) -> list[Line]:
-        """For a terminal of this width, no more than `most` rows."""
+        """Lines for a terminal of this width, of at most `most` rows."""
         safe = [
             ["\n".join(writable(clean(line)) for line in cell.split("\n")) for cell in row] for row in self.rows[:most]
         ]
@@ -163,17 +162,17 @@ class Table:
         return lines
 
     def _layout(self, texts: list[list[str]], width: int) -> tuple[list[int], list[int], list[int]]:
-        """The columns that stay beside each other, those that move beneath them, and the widths of the former."""
-        names, share = self.columns, round(LISTED * width)
+        """The columns to print side by side, the columns to print below them, and the widths of the former."""
+        names, share = self.columns, round(LIST_SHARE * width)
         whole = [_longest(column, WHOLE) for column in texts]
         least = [
             _longest(column, ITEMS if name in self.beneath else WORDS)
             for name, column in zip(names, texts, strict=True)
         ]
-        limits = [round(CUT * width) if name in self.cut else width for name in names]
+        limits = [round(CUT_SHARE * width) if name in self.cut else width for name in names]
 
         def fits(kept: Sequence[int], listed: int) -> bool:
-            """`listed`: the width that columns should have at least which may move beneath."""
+            """`listed`: least width of columns that may move below."""
             shares = (max(least[at], listed if names[at] in self.beneath else share) for at in kept)
             return (
                 sum(min(whole[at], limits[at], wide) + GAP for at, wide in zip(kept, shares, strict=True)) - GAP
@@ -188,19 +187,19 @@ class Table:
             if at in kept and not fits(kept, 0 if name in self.beneath else share):
                 kept.remove(at)
                 (below if name in self.beneath else left_out).append(at)
-        # Columns that have moved beneath may have made room.
+        # Columns that moved below may have made room.
         while left_out and fits([*kept, left_out[-1]], share):
             kept = sorted([*kept, left_out.pop()])
         widths = [whole[at] for at in kept]
         for floors in (whole, least, [1] * len(names)):
             floor = [min(limits[at], floors[at]) for at in kept]
             while sum(widths) + GAP * (len(kept) - 1) > width and any(map(gt, widths, floor)):
-                # The widest gives way, as far as it may.
+                # Narrow the widest column that is still above its floor.
                 widths[max(range(len(kept)), key=lambda at: (widths[at] > floor[at], widths[at]))] -= 1
         return kept, below, widths
 
     def print(self) -> None:
-        """Coloured at a terminal, aligned plain lines elsewhere."""
+        """Print in colour at a terminal, otherwise as aligned plain lines."""
         if at_terminal():
             console().print(picture(self.fitted(console().width)))
         else:
@@ -209,7 +208,7 @@ class Table:
 
 
 def _wide(text: str) -> int:
-    """Columns of a terminal that a text takes."""
+    """Width of a text in terminal columns."""
     from rich.cells import cell_len
 
     return cell_len(text)
@@ -227,8 +226,8 @@ def shortened(text: str, width: int) -> str:
 
 
 def wrapped(text: str, width: int, *, fold: bool = False) -> list[str]:
-    """On lines of this width, broken at newlines if there are some, otherwise at spaces, within parentheses only where
-    nothing else will do. Words that are too long are broken with `fold`, else shortened."""
+    """Break a text into lines of this width: at newlines if it has any, otherwise at spaces, within parentheses only as
+    a last resort. Words that are too long are broken with `fold`, else shortened."""
     lines = [""]
     for part in re.split(ITEMS if "\n" in text else WORDS, text):
         words = [part] if _wide(part) <= width else part.split(" ")
@@ -244,7 +243,7 @@ def wrapped(text: str, width: int, *, fold: bool = False) -> list[str]:
 
 
 def picture(lines: Sequence[Line]) -> Group:
-    """For Rich: lines that fit the terminal."""
+    """A Rich renderable of lines that fit the terminal."""
     from rich.console import Group
     from rich.text import Text
 
@@ -256,8 +255,8 @@ def print_table(columns: Sequence[str], rows: Sequence[Sequence[str]], *, title:
 
 
 class LiveLine:
-    """Drawn in place at a terminal, while lines that stay are printed above it; nothing is drawn elsewhere,
-    or if not `shown`. A context manager: it is gone afterwards, but for one that `stays`."""
+    """A picture redrawn in place at a terminal, with permanent lines printed above it. Nothing is drawn elsewhere, or
+    if not `shown`. A context manager, which removes the picture at the end unless it `stays`."""
 
     def __init__(self, stream: IO[str] | None = None, *, shown: bool = True, stays: bool = False) -> None:
         self._stream = stream or sys.stdout
@@ -272,7 +271,7 @@ class LiveLine:
         self.hide()
 
     def draw(self, picture: str | RenderableType) -> None:
-        """Draws it anew. A text is cut at the terminal's edge."""
+        """Redraw. A text is cut at the terminal's edge."""
         if not self.watched:
             return
         from rich.live import Live
@@ -281,7 +280,7 @@ class LiveLine:
         if isinstance(picture, str):
             text = "\n".join(map(clean, picture.split("\n")))
             picture = Text(text, overflow="ellipsis", no_wrap=True)
-        # Where the terminal is gone, its keys' end or a signal ends the command.
+        # If the terminal is gone, a signal or the end of its input ends the command.
         with suppress(OSError):
             if self._live is None:
                 self._live = Live(
@@ -296,7 +295,7 @@ class LiveLine:
             self._live.update(picture, refresh=True)
 
     def print(self, text: str, style: str = "") -> None:
-        """A line that stays."""
+        """Print a permanent line above the picture."""
         if self._live is None:
             print_line(clean(text), self._stream)
         else:
@@ -304,7 +303,7 @@ class LiveLine:
                 self._live.console.print(clean(text), style=style, soft_wrap=True)
 
     def hide(self) -> None:
-        """Takes it away: the terminal is another's now."""
+        """Remove the picture, to release the terminal."""
         if self._live is not None:
             with suppress(OSError):
                 self._live.stop()
@@ -313,7 +312,7 @@ class LiveLine:
 
 @contextmanager
 def progress(total: int) -> Iterator[Callable[[], None]]:
-    """A bar at a terminal, on stderr; call what it yields once for each of `total` trials."""
+    """A progress bar on stderr at a terminal. Yields a function to call after each of `total` trials."""
     if not at_terminal(sys.stderr):
         yield lambda: None
         return
@@ -327,8 +326,8 @@ def progress(total: int) -> Iterator[Callable[[], None]]:
 
 @contextmanager
 def typed_keys(pressed: Callable[[bytes], None], ended: Callable[[], None]) -> Iterator[None]:
-    """Calls `pressed` with each key typed at the terminal, and `ended` when that is gone. Keys come one by
-    one and are not echoed; the terminal is as before afterwards."""
+    """Call `pressed` with each key typed at the terminal, and `ended` when the terminal is gone. Keys are delivered
+    singly and are not echoed; the terminal's mode is restored at the end."""
     import termios
     import tty
 
@@ -351,6 +350,6 @@ def typed_keys(pressed: Callable[[bytes], None], ended: Callable[[], None]) -> I
         yield
     finally:
         loop.remove_reader(terminal)
-        # A terminal that is gone has no modes to be set back.
+        # A terminal that is gone has no mode to restore.
         with suppress(termios.error):
             termios.tcsetattr(terminal, termios.TCSADRAIN, before)

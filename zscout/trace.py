@@ -1,11 +1,10 @@
-"""What becomes of holds, as lines of JSON in the log `zscout.trace` at level debug: `formal/` holds them against the
-model.
+"""Traces of holds as lines of JSON in the log `zscout.trace` at level debug; `formal/` checks them against the model.
 
-    publish   an RCM: the holders of the RCs that it names
-    over      an RCM: an ARC that it will never grant again
-    promise, hear, read, end, command   an RC: what it heard, and what it holds then
+    publish   by an RCM: the holders of the RCs in its publication
+    over      by an RCM: an ARC that it will never grant again
+    others    by an RC: its input, by kind, and its holds afterwards
 
-Each has the time `at` on this host's monotonic clock, in nanoseconds."""
+Each event has the time `at` on this host's monotonic clock, in nanoseconds."""
 
 from __future__ import annotations
 
@@ -25,12 +24,12 @@ def enabled() -> bool:
 
 
 def write(at: Ns, do: str, **what: Any) -> None:
-    """Ask whether it is `enabled` first: the arguments are not free."""
+    """Log an event. Check `enabled` first, since the arguments cost time."""
     log.debug("%s", msgspec.json.encode({"at": at, "do": do, **what}).decode())
 
 
 def lines(text: Iterable[str]) -> list[Mapping[str, Any]]:
-    """The events among the lines of a log, in the order of time."""
+    """Parse the events in a log, sorted by time."""
     found = (line[line.index('{"at":') :] for line in text if '{"at":' in line)
-    events: list[dict[str, Any]] = [msgspec.json.decode(one) for one in found]
+    events: list[dict[str, Any]] = [msgspec.json.decode(event) for event in found]
     return sorted(events, key=lambda event: event["at"])

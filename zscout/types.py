@@ -1,4 +1,4 @@
-"""Units, amounts and identities that all rooms share.
+"""Units, amounts and identities shared by all rooms.
 
 Times are whole nanoseconds (`Ns`) on one clock of the caller's choice. Bandwidth parameters are `Fraction`, so that
 sums are exact (0.1 + 0.2 is 0.3)."""
@@ -10,16 +10,16 @@ from fractions import Fraction
 from typing import Final, Literal, NamedTuple, TypeAlias
 
 VERSION: Final = "0.3.0"
-"""This zscout's own; pyproject.toml has it as well."""
+"""Also in pyproject.toml."""
 ArcId: TypeAlias = str
-"""Identifies one request for as long as it lives; unique in the fleet. On the mesh `<host>/<client>/<id>`, of
-which the client chooses the id."""
+"""Identifies a request while it is open; unique in the fleet. On the mesh `<host>/<client>/<id>`, where the client
+chooses the id."""
 ClientId: TypeAlias = str
-"""Identifies the program behind requests: `<host>/<client>` on the mesh."""
+"""Identifies a program that makes requests: `<host>/<client>` on the mesh."""
 RcName: TypeAlias = str
 """`kind/name` of a resource controller."""
 Need: TypeAlias = str
-"""What a request asks for: the name of an RC, or a pattern such as `framegrabber/*`."""
+"""The name of an RC, or a pattern such as `framegrabber/*`, in a request."""
 Ns: TypeAlias = int
 """Whole nanoseconds."""
 Params: TypeAlias = Mapping[str, Fraction]
@@ -27,14 +27,14 @@ Params: TypeAlias = Mapping[str, Fraction]
 HostName: TypeAlias = str
 ComponentId: TypeAlias = str
 Kind: TypeAlias = str
-"""What is started: the name of an entry point of the group `zscout.components`."""
+"""Kind of a component: the name of an entry point of the group `zscout.components`."""
 
 SECOND: Final[Ns] = 1_000_000_000
 
 MAX_ROBOT: Final = 254
-"""The greatest id of a robot on a radio: one byte, of which one value means all."""
+"""Greatest id of a robot on a radio: a byte whose value 255 means all robots."""
 MAX_CHANNEL: Final = 15
-"""The greatest video channel that a packet can name."""
+"""Greatest video channel in a packet."""
 
 Metric: TypeAlias = Literal["load_average", "processor_speed", "available_memory", "composite", "auto"]
 Policy: TypeAlias = Literal["least_loaded", "randomized", "two_choices", "pending"]
@@ -43,12 +43,12 @@ POLICIES: Final[tuple[Policy, ...]] = ("least_loaded", "randomized", "two_choice
 
 
 def clean(text: str) -> str:
-    """Words from another host, on one line, unable to draw on a terminal."""
+    """Replace control characters in a text from another host by blanks: it stays on one line and can't draw."""
     return text if text.isprintable() else "".join(char if char.isprintable() else " " for char in text)
 
 
 def span(seconds: float) -> str:
-    """A span of time as people read it: `0.4 s`, `12 s`, `3 min 5 s`, `2 h 4 min`, `3 d 2 h`."""
+    """Format a duration for people: `0.4 s`, `12 s`, `3 min 5 s`, `2 h 4 min`, `3 d 2 h`."""
     seconds = max(0.0, seconds)
     if seconds < 9.95:
         return f"{seconds:.1f} s"
@@ -61,7 +61,7 @@ def span(seconds: float) -> str:
 
 
 class Term(NamedTuple):
-    """The period in which one RCM leads: compared by counter, then by the RCM's instance."""
+    """One RCM's period of leadership: compared by counter, then by the RCM's instance."""
 
     counter: int
     rcm: str
@@ -71,14 +71,14 @@ NO_TERM = Term(0, "")
 
 
 class Grant(NamedTuple):
-    """Identity of one hold: the term it was given in and its number there. A later grant compares greater."""
+    """Identity of a hold: its term and its number within the term. A later grant compares greater."""
 
     term: Term
     seq: int
 
 
 class Place(NamedTuple):
-    """Place in the queue: term and arrival number of the first request; the smaller goes first."""
+    """Place in the queue: term and arrival number of the first request; smaller places go first."""
 
     term: Term
     arrival: int
