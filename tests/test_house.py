@@ -30,7 +30,11 @@ HEADLESS = (
     r"somebody)\b"
 )
 """A clause without its noun: who holds it, what was asked."""
-PLAIN = ["zscout/placement", "zscout/simulation", "zscout/testing"]
+PLAIN = [
+    *("zscout/components", "zscout/config", "zscout/placement", "zscout/simulation", "zscout/testing"),
+    *("zscout/keyexpr.py", "zscout/logs.py", "zscout/ports.py", "zscout/streams.py", "zscout/terminal.py"),
+    *("zscout/trace.py", "zscout/types.py"),
+]
 """Folders and files in plain English: docstrings, comments and messages keep the rates of WORN."""
 WORN = {
     HEADLESS: 1.0,
