@@ -48,6 +48,7 @@ from zscout.messages import (
     RcState,
     Release,
     Unwell,
+    Upcoming,
 )
 from zscout.rcm import steps
 from zscout.rcm.admission import Admission
@@ -289,7 +290,8 @@ def _notice(notice: Notice) -> str:
 
 def _state(notice: Notice) -> str:
     if notice.state == "running" and notice.grant is not None:
-        return f"running by {_grant(notice.grant)} on {', '.join(notice.rcs)}{_waits(notice)}"
+        coming = "".join(f"; {_upcoming(end)}" for end in notice.upcoming)
+        return f"running by {_grant(notice.grant)} on {', '.join(notice.rcs)}{_waits(notice)}{coming}"
     place = f" at place {notice.place.term.counter}.{notice.place.arrival}" if notice.place is not None else ""
     why = notice.problem.message if isinstance(notice.problem, Problem) else notice.reason
     return f"{notice.state}{place}{f' ({notice.outcome})' if notice.outcome else ''}{f': {why}' if why else ''}"
@@ -300,6 +302,13 @@ def _waits(told: Holder | Notice) -> str:
         return ""
     then = f"then {told.remaining:g} s" if isinstance(told, Holder) else f"until {told.remaining:g} s from now"
     return f", which begin within {told.waits:g} s, {then}"
+
+
+def _upcoming(end: Upcoming) -> str:
+    by, rcs = f"{end.by.arc} of {end.by.client}" if end.by.client else end.by.arc, ", ".join(end.rcs)
+    date = "" if end.begins_in is None else f" from in {end.begins_in:g} s on"
+    verb = {"waits": "waits for", "booked": "has booked", "maintenance": "maintains"}[end.code]
+    return f"{by} {verb} {rcs}{date}: safe for {end.safe:g} s"
 
 
 def _grant(grant: Grant) -> str:

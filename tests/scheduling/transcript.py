@@ -15,6 +15,7 @@
         [maintenance] [urgent] [lasting] [broken]       which may name a host: `@anvil`
     unbook ID [now]     redate ID S            slots ID NEED,... start=S until=S [runtime=S] [priority=N] [bookings]
     strategy NAME [patience=S] [half_life=S]   a new core; without it, it is `priority`; a half-life: with fair shares
+    upcoming                                   the holds that may have other upcoming ends, with these
 
 `begins` is the bound on how long an RC needs to begin; `waits`: an ARC waits for it for S seconds at most. What is
 unbooked `now` can't be at present. What is `bound` are the RCs kept for the patterns, in their order. A NEED is
@@ -47,6 +48,7 @@ from zscout.scheduling.booking import (
 from zscout.scheduling.core import Core
 from zscout.scheduling.reason import Reason, ReasonCode
 from zscout.scheduling.strategies import STRATEGIES
+from zscout.scheduling.upcoming import UpcomingEnd
 from zscout.types import Grant, Ns, Params, Place, Term
 
 if TYPE_CHECKING:
@@ -72,6 +74,8 @@ class CorePlayer:
             if words[0] == "at":
                 self.now = ns(words[1])
                 words = words[2].split(maxsplit=2) if len(words) > 2 else []
+            if words and words[0] == "upcoming":
+                return self.upcoming()
             if words and words[0] == "slots":
                 return self.slots(" ".join(words[1:]))
             if words and (event := self.event(words[0], " ".join(words[1:]))) is not None:
@@ -85,6 +89,10 @@ class CorePlayer:
         effects = [*(one for one in decided if one not in wakes), *self.core.tell_reasons(), *wakes]
         validate(self.core)
         return [_print(effect) for effect in effects] or ["nothing"]
+
+    def upcoming(self) -> list[str]:
+        found = [(arc, self.core.upcoming(arc)) for arc in self.core.contended_holds()]
+        return [f"{arc}: {', '.join(map(_upcoming, ends)) or 'nothing'}" for arc, ends in found] or ["none"]
 
     def slots(self, rest: str) -> list[str]:
         """When a booking would be kept: until a vote is missing."""
@@ -282,6 +290,12 @@ def _print(effect: model.Effect) -> str:
             return f"booking {booking} " + ("stands again" if by is None else f"in conflict with {by or 'all choices'}")
         case model.WakeAt(at=at):
             return "wake " + ("never" if at is None else f"at {seconds(at)}")
+
+
+def _upcoming(end: UpcomingEnd) -> str:
+    date = "" if end.begins is None else f" from {seconds(end.begins)}"
+    until = f"safe until {seconds(end.until)}" if end.until else "at any time"
+    return f"{end.code} {end.by.name}{date} for {' '.join(end.rcs)}, {until}"
 
 
 def _told(reason: Reason) -> str:

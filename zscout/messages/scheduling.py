@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from decimal import Decimal
-from typing import Annotated, TypeAlias
+from typing import Annotated, Final, TypeAlias
 
 import msgspec
 
@@ -212,6 +212,20 @@ class Foresight(Message, frozen=True):
 
 
 RequestOperation: TypeAlias = Ask | Cancel | Release | HandOver | Foresee
+MAX_UPCOMING: Final = 16
+
+
+class Upcoming(Message, frozen=True):
+    """A request, a booking or maintenance to which a hold yields. `code`: `waits`, `booked` or `maintenance`."""
+
+    code: str
+    by: ReasonParty
+    rcs: list[str] = []
+    """The RCs of the hold that it is about."""
+    safe: Seconds = 0.0
+    """For so many seconds the hold does not end for it; 0 or less: it may end at any time."""
+    begins_in: Seconds | None = None
+    """Seconds until the date of a booking or maintenance; 0 or less: it has begun."""
 
 
 class Notice(_ArcParty, frozen=True):
@@ -254,6 +268,8 @@ class Notice(_ArcParty, frozen=True):
     """While it runs and devices of it have not begun: seconds, at most, until they have."""
     problem: Problem | None = None
     """Why it ended, where an RCM that took the lead refuses what its client listed."""
+    upcoming: Annotated[list[Upcoming], msgspec.Meta(max_length=MAX_UPCOMING)] = []
+    """While it runs: to which request, and which booking or maintenance, it yields next."""
 
 
 class _Hold(_ArcParty, frozen=True, kw_only=True):

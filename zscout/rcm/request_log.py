@@ -12,6 +12,7 @@ from typing import Any, Final
 
 from msgspec.structs import replace
 
+from zscout import messages
 from zscout.keyexpr import is_pattern
 from zscout.messages import Notice, Problem, ReasonInfo, ReasonParty, State, StoryLine
 from zscout.rcm.places import Places, client_id, request_id
@@ -22,6 +23,7 @@ from zscout.scheduling.forecast import forecast
 from zscout.scheduling.model import ArcStatus, Dropped, Effect, Granted, HoldEnded, HoldTimed, Outcome, Queued
 from zscout.scheduling.reason import ITS_CLIENT, Party, Reason, ended, starting, waits
 from zscout.scheduling.runtimes import RuntimeEstimator
+from zscout.scheduling.upcoming import UpcomingEnd
 from zscout.types import SECOND, ArcId, Grant, Ns, RcName
 
 REMEMBERED: Final[Ns] = 60 * SECOND
@@ -53,6 +55,11 @@ def reason_info(reason: Reason | None, now: Ns) -> ReasonInfo | None:
 def party_info(party: Party, now: Ns) -> ReasonParty:
     yields_in = None if party.until is None else max(0, party.until - now) / SECOND
     return ReasonParty(request_id(party.arc), party.name, client_id(party.arc), party.priority, party.who, yields_in)
+
+
+def upcoming_info(end: UpcomingEnd, now: Ns) -> messages.Upcoming:
+    safe, begins_in = max(0, end.until - now) / SECOND, None if end.begins is None else (end.begins - now) / SECOND
+    return messages.Upcoming(end.code, party_info(end.by, now), list(end.rcs), safe, begins_in)
 
 
 @dataclass(slots=True)
@@ -89,6 +96,8 @@ class RequestLog:
         self._lines: deque[tuple[Ns, ArcId, str, str]] = deque(maxlen=MAX_LINES)  # when, ARC, its name, what happened
         self.traced: list[tuple[str, ArcId]] = []
         """Since the caller took them: ARCs that are over for good, and those that were reopened."""
+        self._upcoming: dict[ArcId, tuple[UpcomingEnd, ...]] = {}
+        """The upcoming ends of holds that their clients were notified of last."""
         self.foretold: dict[ArcId, Ns] = {}
         """ARCs granted in the last instant, with the start that their clients were notified of first."""
         self._unlogged: list[str] = []
@@ -187,6 +196,7 @@ class RequestLog:
             rcs, bound = sorted(arc.needs), dict(arc.bound)
             hosts = {rc: host for rc, (_, host) in self._roster.named(arc.needs).items()}
             known |= {"bound": bound, "hosts": hosts, "waits": None if left is None else left / SECOND}
+            known["upcoming"] = self._note_upcoming(now, arc_id)
             return self._notice(arc_id, "running", grant=hold.grant, rcs=rcs, remaining=remaining, **known)
         return self._notice(
             arc_id,
@@ -199,6 +209,14 @@ class RequestLog:
             starts_in=self._starts_in(now, arc),
             **known,
         )
+
+    def _note_upcoming(self, now: Ns, arc: ArcId) -> list[messages.Upcoming]:
+        ends = self._core.upcoming(arc)
+        if ends:
+            self._upcoming[arc] = ends
+        else:
+            self._upcoming.pop(arc, None)
+        return [upcoming_info(end, now) for end in ends]
 
     def interrupted(self, now: Ns, arc: ArcId, believed: Grant) -> Notice:
         """The present state of a queued request whose client believes in a hold: with how that ended, or as lost where
@@ -263,7 +281,10 @@ class RequestLog:
                         notices.append(notice)
                 case Queued(arc=arc, settled=True) if self._core.is_queued(arc):
                     self._changed[arc] = None
-        if self._report_at is None and (self._changed or self._core.reasons_changed):
+        core = self._core
+        if self._report_at is None and (
+            self._changed or core.reasons_changed or core.upcoming_changed(reported=bool(self._upcoming))
+        ):
             self._report_at = now + REASONS_DELAY
         return notices
 
@@ -288,17 +309,24 @@ class RequestLog:
             changed = [arc for arc in self._changed if arc not in undecided and self._core.is_queued(arc)]
             self._changed = dict.fromkeys(changed)
             self._record_reasons(now)
-            out.notices = self.present(now, changed)
+            out.notices = [*self.present(now, changed), *self._upcoming_notices(now)]
             self._changed = dict.fromkeys(undecided)
             self._report_at = now + REASONS_DELAY if undecided else None
         if self._log_at is not None and self._log_at <= now:
             out.log.append(self._log_text())
         return out
 
+    def _upcoming_notices(self, now: Ns) -> list[Notice]:
+        """The holds that have other upcoming ends than their clients know."""
+        holds = (arc for arc in self._core.contended_holds() if self._is_vouched(arc))
+        changed = [arc for arc in holds if self._core.upcoming(arc) != self._upcoming.get(arc, ())]
+        return [self.notice(now, arc) for arc in changed]
+
     def _close(self, now: Ns, effect: HoldEnded | Dropped) -> Notice:
         """Record how a hold, or the wait for one, ended. A request that is not queued again has ended with it."""
         why = reason_info(effect.reason, now)
         details: dict[str, Any] = {"reason": str(effect.reason), "outcome": effect.outcome, "why": why}
+        self._upcoming.pop(effect.arc, None)
         requeued = isinstance(effect, HoldEnded) and effect.requeued
         again = "; queued again" if requeued else ""
         self.record(now, effect.arc, f"{ended(effect.outcome, str(effect.reason), effect.reason)}{again}")

@@ -54,6 +54,7 @@ class ClaimIndex:
         self.by_id: dict[str, Claim] = {}
         self.maintenance: dict[str, Claim] = {}
         self.claimed = 0  # bits of the RCs booked at any time
+        self.contended = 0  # bits of the RCs whose holders may have another upcoming end (`upcoming.py`)
         self.version = 0  # grows with each change
         self.touched: dict[tuple[Claim, int, Ns, Ns], None] = {}
         """Changed claims, each with its RCs and span before and after; `Calendar` empties it."""
@@ -113,6 +114,7 @@ class ClaimIndex:
         mask, start, end = self._spans[claim]
         if changed:
             self.touched[claim, mask, start, end] = None
+            self.contended |= mask
         for bit in bits(mask):
             self._touched_at[bit] = self.version
 

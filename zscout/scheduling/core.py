@@ -27,6 +27,7 @@ from zscout.scheduling.reason import Reason, ReasonCode, of_rcs
 from zscout.scheduling.runtimes import RuntimeEstimator
 from zscout.scheduling.slots import SlotsFound, slots
 from zscout.scheduling.state import SchedulerState, Strategy
+from zscout.scheduling.upcoming import UpcomingEnd, contended_holds, upcoming
 from zscout.scheduling.votes import HolderSet
 from zscout.types import NO_TERM, ArcId, ClientId, Grant, HostName, Ns, Place, RcName, Term
 
@@ -97,6 +98,21 @@ class Core:
         for arc, reason in reasons_of_now(self._state):
             self.wait(arc, reason)
         return self._effects
+
+    def upcoming_changed(self, *, reported: bool) -> bool:
+        """Return True if a hold may have other upcoming ends than those last reported. `reported`: one had any."""
+        state = self._state
+        contended = (state.index.contended | state.dates.contended) & (state.busy | state.sharable)
+        return bool(contended and (reported or state.queued or state.claims))
+
+    def contended_holds(self) -> list[ArcId]:
+        """The holds whose upcoming ends may have changed since the last call."""
+        return [arc.id for arc in contended_holds(self._state)]
+
+    def upcoming(self, arc_id: ArcId) -> tuple[UpcomingEnd, ...]:
+        """The upcoming ends of a hold."""
+        arc = self._state.running.get(arc_id)
+        return () if arc is None else upcoming(self._state, arc)
 
     @property
     def policy(self) -> SchedulingPolicy:
@@ -614,6 +630,9 @@ class Core:
         # Keep the earlier reason while proposals are open, to avoid flapping.
         if reason == arc.reason or (not settled and arc.reason):
             return
+        for why in (arc.reason, reason):
+            if why is not None and why.code is ReasonCode.VETOED:
+                self._state.index.contended |= self._state.mask(why.rcs)
         arc.reason = reason
         self._effects.append(model.Queued(arc.id, arc.request.client, reason, settled))
 

@@ -33,6 +33,7 @@ class QueueIndex:
         self.touched = 0  # bits of the RCs with other changes: these affect all but watchers
         self.unreported = 0  # bits of the RCs with new holders that are not reported to watchers yet
         self.unreported_classes: dict[PatternClass, None] = {}
+        self.contended = 0  # bits of the RCs whose holders may have another upcoming end (`upcoming.py`)
         self.ranks: list[Rank] = []  # of all queued ARCs, best first
         self._not_starving: list[tuple[Ns, ArcId]] = []  # queued ARCs, by when they begin to starve
         self.starving: list[tuple[int, Ns, ArcId]] = []  # by band of priorities (negated), then by when they began

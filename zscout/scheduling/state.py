@@ -56,6 +56,8 @@ class SchedulerState:
         self._matching: dict[Need, list[Rc]] = {}
         self._matching_masks: dict[Need, int] = {}
         self.classes: dict[Hashable, PatternClass] = {}
+        self.chosen: dict[ArcId, ArcId] = {}
+        """By running ARC: the queued one for a pattern of which it is likely to end (`upcoming.py`)."""
         self.running_by_owner: Counter[str] = Counter()
         self.held_by_owner: Counter[str] = Counter()
         self._by_bit: list[Rc] = []
@@ -237,17 +239,23 @@ class SchedulerState:
             self._classify(arc)
         self._count_demand(arc, 1)
         self.index.add(arc)
+        self.index.contended |= self._wanted(arc)
 
     def dequeue(self, arc: Arc) -> None:
         if self.held_back.pop(arc.id, None) is not None:
             arc.held_back = None
             return
         del self.queued[arc.id]
+        self.index.contended |= self._wanted(arc)
         self._count_demand(arc, -1)
         self.index.remove(arc)
         if arc.patterns:
             del self.by_pattern[arc.id]
             self._declassify(arc)
+
+    def _wanted(self, arc: Arc) -> int:
+        """Bits of the RCs that a queued ARC names, or that match its patterns."""
+        return arc.named_mask if arc.like is None else arc.named_mask | arc.like.reach
 
     def _classify(self, arc: Arc) -> None:
         like = arc.like = self.classes.setdefault(self._class_key(arc), self.class_for(arc))
@@ -386,6 +394,7 @@ class SchedulerState:
             self.dates.put(arc.claim)
         self.busy &= ~arc.mask
         self.index.freed |= arc.mask
+        self.index.contended |= arc.mask
         return hold
 
     def retime(self, arc: Arc, hold: Hold) -> None:
@@ -395,6 +404,7 @@ class SchedulerState:
             if end is not None:
                 heapq.heappush(self._ends, (end, arc.id))
         self.index.freed |= arc.mask
+        self.index.contended |= arc.mask
         self._grow(arc.mask, max(before, arc.known_end()))
 
     def set_begin_within(self, name: RcName, begin_within: Ns | None) -> None:
