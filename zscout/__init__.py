@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from zscout.behaviors.client.blocking import BlockingHeld, Lab, connect
     from zscout.behaviors.client.bookings import BookingsClient
     from zscout.behaviors.client.client import Client, CommandRefused, NoRcm, RequestRefused
+    from zscout.behaviors.client.hold_notices import HoldNotice
     from zscout.behaviors.client.lab_status import LabStatus
     from zscout.behaviors.client.request import OpenArc
     from zscout.behaviors.components.component import Component, ComponentContext, Stage
@@ -38,6 +39,7 @@ _NAMES = {
     "zscout.behaviors.client.blocking": "BlockingHeld Lab connect",
     "zscout.behaviors.client.bookings": "BookingsClient",
     "zscout.behaviors.client.client": "Client CommandRefused NoRcm RequestRefused",
+    "zscout.behaviors.client.hold_notices": "HoldNotice",
     "zscout.behaviors.client.lab_status": "LabStatus",
     "zscout.behaviors.client.request": "OpenArc",
     "zscout.behaviors.components.component": "Component ComponentContext Stage",
@@ -50,8 +52,8 @@ _HOME = {name: module for module, names in _NAMES.items() for name in names.spli
 
 __all__ = [
     "BadInput", "BlockingHeld", "BookingsClient", "Client", "CommandRefused", "Component", "ComponentContext",
-    "Fleet", "Frame", "Held", "Lab", "LabStatus", "MeshError", "NoRcm", "OpenArc", "RequestRefused", "Revoked",
-    "Stage", "__version__", "connect", "hold", "holds", "load_fleet",
+    "Fleet", "Frame", "Held", "HoldNotice", "Lab", "LabStatus", "MeshError", "NoRcm", "OpenArc", "RequestRefused",
+    "Revoked", "Stage", "__version__", "connect", "hold", "holds", "load_fleet",
 ]  # fmt: skip
 
 

@@ -9,7 +9,8 @@ client says so or is gone (CHANNEL, a socket, has ended), at the deadline that i
 when COMMAND itself has ended. `gone` is said when the last process of the tree is no more.
 
 Words on CHANNEL are lines. From the client: `until NS` (the deadline, by the clock of `now`; the first stands there
-before the guardian starts), `end NS` (the grace counts from then), `kill` (without grace), `continue`. To it:
+before the guardian starts), `end NS` (the grace counts from then), `kill` (without grace), `continue`, `signal NUMBER`
+(to COMMAND, once it catches that signal: else it would be killed, perhaps before it could). To it:
 `started PID`, `stopped SIGNAL`, `ending WHY` (`deadline`, `client`, `signal`: sent to the guardian), `exited CODE` (of
 COMMAND alone; negative: by that signal), `stuck PID` (it runs as another user, and can't be ended; 0: /proc shows no
 process, and something lives), `gone`.
@@ -136,6 +137,13 @@ def descendants(root: int) -> list[Descendant]:
     return [one for one in found if not one.dead]
 
 
+def caught_by(pid: int) -> int:
+    """The signals that a process catches: bit 0 is signal 1. None where /proc does not show it."""
+    with suppress(OSError, ValueError), open(f"/proc/{pid}/status") as file:  # noqa: PTH123
+        return next((int(line[7:], 16) for line in file if line.startswith("SigCgt:")), 0)
+    return 0
+
+
 def is_hidden() -> bool:
     """Whether /proc shows no process, not even this one: those in sessions of their own can't be found and ended."""
     return not os.path.exists(f"/proc/{os.getpid()}/stat")  # noqa: PTH110
@@ -204,6 +212,8 @@ class Guardian:
         self._group = ControlGroup()
         self._leader = self._command = 0
         """The command, until it was waited for; from then on its number may be another's. And its group."""
+        self._signals: set[int] = set()
+        """Those that COMMAND is to get once it catches them."""
         self._pause, self._round = ROUND, 0
         """Between two rounds of SIGKILL, and when the next one is."""
         self._stuck: set[int] = set()
@@ -293,6 +303,8 @@ class Guardian:
                 self._ask("deadline")
             if (self._why or self._leader == 0) and not self._told:
                 self._end()
+            if self._signals and self._leader:
+                self._signal_command()
             at = now()
             if self._ending.kills(at) and at >= self._round:
                 self._kill()
@@ -353,6 +365,13 @@ class Guardian:
                     self._stuck.add(one.pid)
                     self._say(f"stuck {one.pid}")
 
+    def _signal_command(self) -> None:
+        caught = caught_by(self._leader)
+        for number in [number for number in self._signals if caught >> (number - 1) & 1]:
+            self._signals.discard(number)
+            with suppress(OSError):
+                os.kill(self._leader, number)
+
     def _to_group(self, number: int) -> bool:
         """To the command's group, if that is still its: it is while the command, or another child, is in it."""
         with suppress(ChildProcessError, ProcessLookupError, PermissionError):
@@ -404,6 +423,8 @@ class Guardian:
             self._ending.hurry(now())
         elif word == "continue":
             self._to_group(signal.SIGCONT)
+        elif word == "signal":
+            self._signals.add(int(number))
 
 
 def main() -> None:

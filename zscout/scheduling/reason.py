@@ -185,8 +185,9 @@ def ended(outcome: str, reason: str, why: Reason | ReasonInfo | None) -> str:
     return reason if why is not None and why.code in _OUTCOMES else f"{word}: {reason}" if reason else word
 
 
-KEPT: Final = "until somebody waits for it"
-"""How long a hold goes on after its minimum runtime, if it is kept."""
+def kept(priority: int) -> str:
+    """How long a hold of this priority continues after its minimum runtime, if it is kept."""
+    return f"until a request of priority {priority} or more waits for it"
 
 
 def starting(left: float) -> str:

@@ -46,7 +46,7 @@ def test_a_command_gets_its_grant_and_gives_its_exit_code(fleet: CliFleet) -> No
     assert grant.startswith("[[")
     assert "/request-" in client
     assert 50 < float(remaining) <= 60
-    yours = rf"yours for (1 min|\d\d s) \(until {CLOCK}\), then until somebody waits for it"
+    yours = rf"yours for (1 min|\d\d s) \(until {CLOCK}\), then until a request of priority 0 or more waits for it"
     assert re.search(rf"survey holds radio/rf0, robot/a: {yours}", done.stderr)
     assert fleet.idle("robot/a", "radio/rf0")
 
@@ -153,7 +153,9 @@ def test_a_command_goes_on_past_its_minimum_runtime_until_an_equal_waits(fleet: 
         "pid", "request", "robot/a", "--name", "kept", "--min-runtime", "300ms", "--", "sh", "-c", script
     )
     assert re.fullmatch(
-        rf"kept holds robot/a: yours for 0\.\d s \(until {CLOCK}\), then until somebody waits for it", first[0]
+        rf"kept holds robot/a: yours for 0\.\d s \(until {CLOCK}\), then until a request of priority 0 or more waits "
+        "for it",
+        first[0],
     )
     fleet.state(lambda state: [hold.remaining < -0.5 for hold in state.holds] == [True])
     assert kept.poll() is None
@@ -368,8 +370,8 @@ def test_where_nothing_can_be_said_a_command_runs_all_the_same(fleet: CliFleet, 
 @pytest.mark.parametrize(
     ("keep", "longest", "then"),
     [
-        (True, None, "until somebody waits for it"),
-        (True, 120 * SECOND, "until somebody waits for it, 2 min in all at most"),
+        (True, None, "until a request of priority 0 or more waits for it"),
+        (True, 120 * SECOND, "until a request of priority 0 or more waits for it, 2 min in all at most"),
         (True, 60 * SECOND, "given back"),
         (False, None, "given back"),
     ],

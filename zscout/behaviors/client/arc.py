@@ -12,7 +12,8 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import AsyncGenerator, AsyncIterator, Mapping
+from collections import deque
+from collections.abc import AsyncGenerator, AsyncIterator, Callable, Mapping
 from contextlib import closing, suppress
 from decimal import Decimal
 from typing import Any, Final
@@ -20,11 +21,12 @@ from typing import Any, Final
 from zscout.behaviors.client.bookings import BookingsClient
 from zscout.behaviors.client.client import Client
 from zscout.behaviors.client.direct import DirectHold
+from zscout.behaviors.client.hold_notices import HoldNotice, NoticeTracker
 from zscout.behaviors.client.request import CommandRefused, HoldEnd, Needs, OpenArc, check_seconds
 from zscout.keyexpr import is_pattern
 from zscout.mesh.frames import Frame
 from zscout.messages import Done
-from zscout.scheduling.reason import KEPT
+from zscout.scheduling.reason import kept
 from zscout.types import SECOND, Grant, Ns
 
 log = logging.getLogger(__name__)
@@ -57,6 +59,8 @@ class Held:
         """The devices that it holds, sorted."""
         self.bound: dict[str, str] = dict(arc.bound)
         """For each pattern of the needs, the device that satisfies it."""
+        self._tracker, self._notices = NoticeTracker(), deque[HoldNotice]()
+        self._calling: set[asyncio.Task[None]] = set()
 
     def rc(self, need: str) -> str:
         """Return the device that satisfies a need: `held.rc("framegrabber/*")`. Raises KeyError for a need that was not
@@ -87,6 +91,41 @@ class Held:
         if self.active:
             return not self.arc.keep and self.remaining <= 0 and not self.settling
         return self.arc.outcome == "completed"
+
+    @property
+    def upcoming(self) -> list[HoldNotice]:
+        """The request that waits, and the booking or maintenance, to which this hold yields next."""
+        return list(self.arc.upcoming) if self.active else []
+
+    async def noticed(self) -> HoldNotice | None:
+        """Wait for the next notice of what the hold yields to; those that are known already come first. None: the hold
+        is over."""
+        while True:
+            self._notices += self._tracker.take(self.upcoming, self.now()) if self.active else []
+            if self._notices:
+                return self._notices.popleft()
+            if not self.active or self.completed:
+                return None
+            due, now = self._tracker.next, self.now()
+            ends = [] if self.arc.keep or self.settling else [self.arc.end]
+            at = min([*ends, *([due] if due is not None else [])], default=None)
+            with suppress(TimeoutError):
+                async with asyncio.timeout(None if at is None else max(0, at - now) / SECOND):
+                    await self._client.changed(self.arc)
+
+    def on_notice(self, callback: Callable[[HoldNotice], object]) -> None:
+        """Call `callback` with each notice that `noticed` would return, until the hold is over."""
+        task = asyncio.create_task(self._call_back(callback))
+        self._calling.add(task)
+        task.add_done_callback(self._calling.discard)
+
+    async def _call_back(self, callback: Callable[[HoldNotice], object]) -> None:
+        own = Held(self._client, self.arc, self.grant)
+        while (notice := await own.noticed()) is not None:
+            try:
+                callback(notice)
+            except Exception:
+                log.exception("a callback of %s failed", self.arc.name)
 
     @property
     def settling(self) -> bool:
@@ -157,7 +196,7 @@ class Held:
     def words(self) -> str:
         """The request, the devices, and how long they are held or why no longer."""
         if self.active and not self.completed:
-            stands = f"{self.remaining:.0f} s left" if self.remaining > 0 else KEPT
+            stands = f"{self.remaining:.0f} s left" if self.remaining > 0 else kept(self.arc.priority)
         else:
             ending = None if self.active else self.arc._ending
             stands = f"over: {ending.reason or ending.outcome}" if ending is not None else "over"

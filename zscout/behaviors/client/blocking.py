@@ -26,6 +26,7 @@ import uvloop
 
 from zscout.behaviors.client.arc import Attempt, Held, Revoked, hold
 from zscout.behaviors.client.client import Client, NoRcm
+from zscout.behaviors.client.hold_notices import HoldNotice
 from zscout.behaviors.client.interruption import InterruptibleBody, interruptible, uninterrupted
 from zscout.behaviors.client.lab_status import LabStatus
 from zscout.behaviors.client.request import HoldEnd, Needs
@@ -80,6 +81,20 @@ class BlockingHeld:
         """Call `callback` in a thread of zscout's once the hold is over; at once if it is. What takes long there delays
         other holds of this lab."""
         self._lab.run(self._call_when_over(callback))
+
+    @property
+    def upcoming(self) -> list[HoldNotice]:
+        """The request that waits, and the booking or maintenance, to which this hold yields next."""
+        return self._held.upcoming
+
+    def on_notice(self, callback: Callable[[HoldNotice], object]) -> None:
+        """Call `callback` in a thread of zscout's with each notice of what the hold yields to, and when that no longer
+        comes; at once with those that are known. What takes long there delays other holds of this lab."""
+        self._lab.run(self._call_when_noticed(callback))
+
+    async def noticed(self) -> HoldNotice | None:
+        """Wait, in any event loop, for the next such notice. None: the hold is over."""
+        return await asyncio.wrap_future(self._lab.submit(self._held.noticed()))
 
     async def over(self) -> None:
         """Wait, in any event loop, until the hold is over."""
@@ -167,6 +182,9 @@ class BlockingHeld:
         self._watches.add(over)
         over.add_done_callback(self._watches.discard)
         over.add_done_callback(lambda task: task.cancelled() or callback())
+
+    async def _call_when_noticed(self, callback: Callable[[HoldNotice], object]) -> None:
+        self._held.on_notice(callback)
 
     async def _over_within(self, timeout: float | None) -> bool:
         return await done_within(timeout, self._held.over())

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from html import escape
 
 from zscout.messages import HoldView, RcmState, RcView
-from zscout.scheduling.reason import KEPT, named, starting
+from zscout.scheduling.reason import kept, named, starting
 from zscout.types import clean
 
 Row = tuple[str, ...]
@@ -61,7 +61,7 @@ def _held(hold: HoldView) -> str:
     who = named(hold.who, hold.client, hold.arc)
     if hold.waits is not None:
         return f"{who}, {starting(hold.waits)}"
-    return f"{who}, {hold.remaining:.0f} s left" if hold.remaining > 0 else f"{who}, {KEPT}"
+    return f"{who}, {hold.remaining:.0f} s left" if hold.remaining > 0 else f"{who}, {kept(hold.priority)}"
 
 
 def _aligned(head: Row, rows: Sequence[Row]) -> Iterator[str]:

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple, Self
 
 import msgspec
 
+from zscout.behaviors.client.hold_notices import HoldNotice
 from zscout.keyexpr import BadName, check_name, check_need, check_rc, is_pattern, matcher, new_instance
 from zscout.messages import Amounts, Ask, Cancel, Notice, OpenRequest, Problem, ReasonInfo, Release, Who, carried
 from zscout.types import NO_TERM, SECOND, Grant, Ns, Place, Term
@@ -118,6 +119,8 @@ class OpenArc:
     """When the minimum runtime of the present hold is over, at the latest."""
     ready: Ns | None = None
     """While devices of the present hold are starting: when they are ready, at the latest. Its runtime begins then."""
+    upcoming: list[HoldNotice] = field(default_factory=list)
+    """While it runs: the request, and the booking or maintenance, to which the hold yields next."""
     since: Ns = 0
     """When `state` began."""
     _waits_since: Ns | None = None
@@ -194,6 +197,7 @@ class OpenArc:
             self.hosts = notice.hosts
             self.ready = None if notice.waits is None else now + round(notice.waits * SECOND)
             self.end = now + round((notice.remaining or 0.0) * SECOND)
+            self.upcoming = [HoldNotice.of(end, now) for end in notice.upcoming]
         return True
 
     def _binding(self, notice: Notice) -> dict[str, str] | None:
@@ -213,6 +217,7 @@ class OpenArc:
     def _close(self, ending: HoldEnd, now: Ns) -> None:
         if self.grant is not None:
             self.grant, self._ending, self._waits_since, self.ready = None, ending, now, None
+            self.upcoming = []
         elif self._waits_since is None:
             self._waits_since = now
 

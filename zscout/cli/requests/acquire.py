@@ -31,6 +31,7 @@ from zscout.cli.requests.options import (
     hold_options,
     infra_exit_option,
     is_descriptor,
+    notify_signal_option,
     parse_duration,
     priority_option,
     tolerate_option,
@@ -222,8 +223,9 @@ def _known() -> str:
 @token_argument
 @infra_exit_option
 @grace_option
+@notify_signal_option
 @common.runs
-async def run(token: str, grace: Decimal | None, infra_exit: int | None) -> int:
+async def run(token: str, grace: Decimal | None, infra_exit: int | None, notify_signal: int | None) -> int:
     """Run a command under the hold of a token that `zscout acquire` printed.
 
     The command finds the same variables in its environment as with `zscout request -- COMMAND`, and ends as it does
@@ -257,13 +259,19 @@ async def run(token: str, grace: Decimal | None, infra_exit: int | None) -> int:
         longest, text = grace_within(grace, begun.grace)
         if text:
             print_line(text, sys.stderr)
-        return await _run(held, command, begun, longest, write, infra_exit)
+        return await _run(held, command, begun, longest, write, infra_exit, notify_signal)
     finally:
         held.channel.close()
 
 
 async def _run(
-    held: UsedToken, command: tuple[str, ...], begun: FromHolder, grace: float, kept: int, infra_exit: int | None
+    held: UsedToken,
+    command: tuple[str, ...],
+    begun: FromHolder,
+    grace: float,
+    kept: int,
+    infra_exit: int | None,
+    notify_signal: int | None,
 ) -> int:
     """Under the hold. `kept` is closed."""
     ended: FromHolder | None = None
@@ -275,7 +283,12 @@ async def _run(
             if word is None:
                 word = FromHolder("end", at=now(), why=DIED, code=TAKEN_AWAY)
                 break
-            running.hold_until(word.at)
+            if word.op == "until":
+                running.hold_until(word.at)
+            elif word.op == "notice":
+                print_line(clean(f"zscout: {word.why}"), sys.stderr)
+                if notify_signal is not None and not word.withdrawn:
+                    running.signal(notify_signal)
         ended = word
         running.terminate(word.at)
 

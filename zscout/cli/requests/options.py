@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 import shlex
+import signal
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -266,6 +267,8 @@ class HoldOptions:
     booking: str = ""
     """The id of the booking that it takes up."""
     infra_exit: int | None = None
+    notify_signal: int | None = None
+    """What the command gets when the hold is to yield to somebody."""
     events: EventFile | None = None
     direct: bool = False
     """Whether programs touch the devices past zscout; those of a command do."""
@@ -296,6 +299,7 @@ def hold_options(command: F, *, needs_required: bool = True, runs_command: bool 
             help="Give the devices back after this time, even if nobody waits; instead of --min-runtime.",
         ),
         grace_option,
+        notify_signal_option,
         click.option(
             "--min-runtime",
             type=Parsed("duration", parse_duration),
@@ -342,6 +346,25 @@ grace_option: Final = click.option(
     type=Parsed("duration", partial(parse_duration, zero=True)),
     help="Time from SIGTERM to SIGKILL for the command: at most, and by default, nine tenths of what devices settle "
     "(`settle`, 5 s).",
+)
+
+
+def parse_signal(text: str, option: str) -> int:
+    """`USR1`, `SIGUSR1` or a number. Raises BadInput."""
+    name = text.upper().removeprefix("SIG")
+    known = {found.name.removeprefix("SIG"): int(found) for found in signal.Signals}
+    number = int(name) if name.isascii() and name.isdigit() else known.get(name, 0)
+    if number not in known.values() or number in (signal.SIGKILL, signal.SIGSTOP):
+        raise BadInput(f"{option}: {quoted(text)} is not a signal that a command can catch; write USR1, USR2 or HUP")
+    return number
+
+
+notify_signal_option: Final = click.option(
+    "--notify-signal",
+    metavar="NAME",
+    type=Parsed("signal", parse_signal),
+    help="Send the command this signal when another request waits for the devices, or a booking or maintenance will "
+    "end the hold: USR1. Only once the command catches it.",
 )
 infra_exit_option: Final = click.option(
     INFRA_EXIT,
@@ -392,6 +415,8 @@ def gather(
     if command:
         check_command(command)
         default_name = valid_name(Path(command[0]).name)
+    if rest.get("notify_signal") is not None and not command:
+        raise BadInput("--notify-signal is for a command; add one after --")
     if rest["again"] and not command:
         raise BadInput("--again repeats a command; add one after --")
     return HoldOptions(

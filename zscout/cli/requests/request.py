@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import signal
 import sys
-from collections.abc import AsyncIterator, Coroutine, Iterator
+from collections.abc import AsyncIterator, Callable, Coroutine, Iterator
 from contextlib import ExitStack, asynccontextmanager, closing, contextmanager, nullcontext, suppress
 from functools import partial
 from typing import IO, Any, Final
@@ -17,6 +17,7 @@ from msgspec.structs import replace
 from zscout.behaviors.client.arc import Held
 from zscout.behaviors.client.client import QUERY_TIMEOUT, Client, CommandRefused
 from zscout.behaviors.client.direct import DEFAULT_SETTLE, DirectHold
+from zscout.behaviors.client.hold_notices import HoldNotice
 from zscout.behaviors.client.request import HoldEnd, OpenArc
 from zscout.cli import common, completion
 from zscout.cli.booked import BOOKING
@@ -39,7 +40,7 @@ from zscout.cli.requests.waiting import NeedContention, contention_of, hold_text
 from zscout.config.strict import BadInput
 from zscout.mesh.supervision import done_within
 from zscout.messages import Foresight, RcmState, RcState, StateAsk, version_words
-from zscout.scheduling.reason import KEPT, ReasonCode, starting, waits
+from zscout.scheduling.reason import ReasonCode, kept, starting, waits
 from zscout.terminal import LiveLine, clean, clock, print_json, print_line, span
 from zscout.types import SECOND, VERSION, Ns
 
@@ -221,7 +222,8 @@ async def _use(client: Client, wanted: HoldOptions, report: Report, arc: OpenArc
                 code = await _run(wanted, report, held, client)
             else:
                 with _never_suspended(report):
-                    async with report.telling(report.follow_hold(arc)):
+                    noticing = report_notices(report, held, User.of(client))
+                    async with report.telling(report.follow_hold(arc)), common.beside(noticing):
                         await held.over()
     except BaseException:
         await client.end(arc)
@@ -278,6 +280,21 @@ def reporting_unwell(report: Report, held: Held, client: Client) -> Iterator[Non
         yield
 
 
+async def report_notices(
+    report: Report, held: Held, me: User, noticed: Callable[[HoldNotice, str], object] = lambda *_: None
+) -> None:
+    """Report what the hold yields to, until it is over; `noticed` is called with each notice and its words."""
+    while (notice := await held.noticed()) is not None:
+        now, by = held.now(), request_words(notice.by.arc, notice.by.who, notice.by.client, me=me)
+        details: dict[str, Any] = {"code": notice.code, "withdrawn": notice.withdrawn, "by": notice.by}
+        details |= {"rcs": notice.rcs, "safe": round(max(0, notice.safe_until - now) / SECOND, 3)}
+        if notice.begins is not None:
+            details["begins_in"] = round((notice.begins - now) / SECOND, 3)
+        text = f"{held.arc.name}: {clean(notice.text(now, clock, by))}"
+        report.event("notice", text, **details)
+        noticed(notice, text)
+
+
 @contextmanager
 def _never_suspended(report: Report) -> Iterator[None]:
     """Ctrl-Z would lose what is held: this client could not confirm it any more."""
@@ -301,7 +318,8 @@ async def _run(wanted: HoldOptions, report: Report, held: Held, client: Client) 
             command.terminate(hold.ended_at)
 
     try:
-        async with command, common.beside(_tell_who_is_old(report, held, client, direct)):
+        noticing = report_notices(report, held, User.of(client), partial(_signal, command, wanted.notify_signal))
+        async with command, common.beside(_tell_who_is_old(report, held, client, direct)), common.beside(noticing):
             if direct is not None:
                 direct.watch(follow)
                 follow(direct)
@@ -321,6 +339,11 @@ async def _run(wanted: HoldOptions, report: Report, held: Held, client: Client) 
         if held.active:
             await client.end(held.arc)
     return None
+
+
+def _signal(command: RunningCommand, number: int | None, notice: HoldNotice, _text: str) -> None:
+    if number is not None and not notice.withdrawn:
+        command.signal(number)
 
 
 async def _tell_who_is_old(report: Report, held: Held, client: Client, direct: DirectHold | None) -> None:
@@ -365,12 +388,12 @@ async def _taken(client: Client, wanted: HoldOptions, report: Report, arc: OpenA
 def _yours(arc: OpenArc, left: float, longest: Ns | None) -> str:
     """For how long a hold goes on, of which so many seconds are protected; `longest` as the fleet allows."""
     goes_on = arc.keep and (longest is None or arc.min_runtime * SECOND < longest)
-    then = _kept(longest) if goes_on else "given back"
+    then = _kept(longest, arc.priority) if goes_on else "given back"
     return f"yours for {span(left)} (until {clock(left)}), then {then}"
 
 
-def _kept(longest: Ns | None) -> str:
-    return KEPT if longest is None else f"{KEPT}, {span(longest / SECOND)} in all at most"
+def _kept(longest: Ns | None, priority: int) -> str:
+    return kept(priority) if longest is None else f"{kept(priority)}, {span(longest / SECOND)} in all at most"
 
 
 def ending_of(arc: OpenArc) -> HoldEnd:
@@ -482,7 +505,11 @@ class Report(LiveLine):
             now = self._mesh.now()
             left = (arc.end - now) / SECOND
             protected = left > 0 or not arc.keep
-            rest = _yours(arc, left, longest) if protected else f"for {span(self._since(arc))}, {_kept(longest)}"
+            rest = (
+                _yours(arc, left, longest)
+                if protected
+                else f"for {span(self._since(arc))}, {_kept(longest, arc.priority)}"
+            )
             rest = rest if arc.ready is None else starting((arc.ready - now) / SECOND)
             self.draw(f"{arc.name} holds {held_text(arc)}: {rest}\n  Ctrl-C gives back")
             await done_within(REFRESH if self.watched else None, self.changed.wait())

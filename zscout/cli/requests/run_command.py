@@ -150,6 +150,10 @@ class RunningCommand:
     def gone(self) -> bool:
         return self._gone.done()
 
+    def signal(self, number: int) -> None:
+        """Send a signal to the command itself, once it catches that."""
+        self._say(f"signal {number}")
+
     def terminate(self, at: Ns) -> None:
         """SIGTERM to all of it; SIGKILL follows a grace after `at`. Once, however often it is called."""
         if not self._told:

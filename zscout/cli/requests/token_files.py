@@ -58,7 +58,8 @@ class ToHolder(msgspec.Struct, frozen=True):
 
 
 class FromHolder(msgspec.Struct, frozen=True, omit_defaults=True):
-    """From it: `hold` (a command may run), `until`, `end`, `done`, `refused`."""
+    """From it: `hold` (a command may run), `until`, `notice` (what the hold yields to, in words), `end`, `done`,
+    `refused`."""
 
     op: str
     env: dict[str, str] = {}
@@ -68,6 +69,8 @@ class FromHolder(msgspec.Struct, frozen=True, omit_defaults=True):
     """`hold`, `until`: when a command is to be ended unless a later time comes. `end`: when the hold ended."""
     why: str = ""
     code: int = 0
+    withdrawn: bool = False
+    """`notice`: that no longer comes."""
     remaining: float = 0
     """`done`, of `renew`: seconds for which the hold is protected."""
 

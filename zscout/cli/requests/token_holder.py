@@ -20,9 +20,11 @@ import msgspec
 from zscout.behaviors.client.arc import Held
 from zscout.behaviors.client.client import Client, CommandRefused
 from zscout.behaviors.client.direct import DEFAULT_SETTLE, DirectHold
+from zscout.behaviors.client.hold_notices import HoldNotice
 from zscout.behaviors.client.request import OpenArc
 from zscout.cli import common
 from zscout.cli.common import Failed
+from zscout.cli.ownership import User
 from zscout.cli.requests import token_files
 from zscout.cli.requests.options import HoldOptions
 from zscout.cli.requests.request import (
@@ -31,6 +33,7 @@ from zscout.cli.requests.request import (
     Report,
     ending_of,
     held_text,
+    report_notices,
     reporting_unwell,
     tolerate,
     wait_for_grant,
@@ -77,6 +80,8 @@ class TokenHolder:
         self._direct: DirectHold | None = client.internals.direct_hold(held.grant)
         self._limit: Ns = held.now() + round(seconds * SECOND)
         self._runs: set[_Run] = set()
+        self._noticed: dict[str, str] = {}
+        """What the hold yields to, in words."""
         self._releasing: list[TokenChannel] = []
         self._ending: asyncio.Future[TokenEnding] = asyncio.get_running_loop().create_future()
         self._changed = asyncio.Event()
@@ -103,6 +108,14 @@ class TokenHolder:
             self._server = server
             if followed is not None:
                 loop.remove_reader(followed)
+
+    def notice(self, notice: HoldNotice, text: str) -> None:
+        """Let the commands know what the hold yields to, and those that come."""
+        self._noticed.pop(notice.code, None)
+        if not notice.withdrawn:
+            self._noticed[notice.code] = text
+        for run in self._runs:
+            run.channel.send(FromHolder("notice", why=text, withdrawn=notice.withdrawn))
 
     async def give_back(self, ending: TokenEnding) -> bool:
         """End the commands, then give the devices back; False where a command can't be ended: they are left to
@@ -196,6 +209,8 @@ class TokenHolder:
             self._runs.add(run)
             grace = (self._direct.grace if self._direct is not None else DEFAULT_SETTLE) / SECOND
             channel.send(FromHolder("hold", hold_variables(self._held, self._client), float(grace), self._sure_until))
+            for text in self._noticed.values():
+                channel.send(FromHolder("notice", why=text))
             await asyncio.gather(self._note_client(run), self._note_tree(run, tree))
         finally:
             self._runs.discard(run)
@@ -265,8 +280,10 @@ async def hold(client: Client, wanted: HoldOptions, seconds: float, follow: int 
             else:
                 starter.close()
                 _detach(wanted)
+                noticing = report_notices(report, held, User.of(client), holder.notice)
                 with reporting_unwell(report, held, client):
-                    ending = await holder.until_over(path, followed)
+                    async with common.beside(noticing):
+                        ending = await holder.until_over(path, followed)
         except asyncio.CancelledError:
             if (task := asyncio.current_task()) is not None:
                 task.uncancel()

@@ -1,0 +1,90 @@
+"""Notices to the holder: which request, booking or maintenance its hold yields to next. Pure; times in ns on this
+host's clock."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Final, NamedTuple
+
+from zscout.messages import ReasonParty, Upcoming
+from zscout.scheduling.reason import named
+from zscout.types import SECOND, Ns, clean
+
+WITHDRAWN_AFTER: Final[Ns] = 3 * SECOND // 2
+"""A new leader may hear of the waiting requests a little after it has answered the holder."""
+SAME: Final[Ns] = 2 * SECOND
+"""A smaller change of a time is not reported."""
+
+
+class HoldNotice(NamedTuple):
+    """A request waits for devices of a hold (`code` is `waits`), or they are booked (`booked`) or kept for maintenance
+    (`maintenance`): the hold yields to that. `withdrawn`: no longer."""
+
+    code: str
+    by: ReasonParty
+    """The request or booking, with its name (`arc`), priority and person (`who`)."""
+    rcs: list[str]
+    """The devices of the hold that it is about."""
+    safe_until: Ns
+    """The hold does not end for it before, by the clock of `held.now()`. In the past: it may end at any time."""
+    begins: Ns | None = None
+    """The date of a booking or maintenance, by the same clock."""
+    withdrawn: bool = False
+
+    @classmethod
+    def of(cls, end: Upcoming, now: Ns) -> HoldNotice:
+        begins = None if end.begins_in is None else now + round(end.begins_in * SECOND)
+        return cls(end.code, end.by, end.rcs, now + round(end.safe * SECOND), begins)
+
+    def is_like(self, other: HoldNotice, now: Ns) -> bool:
+        """Return True if this tells a holder nothing that `other` has not told."""
+        times = zip((self.safe_until, self.begins or 0), (other.safe_until, other.begins or 0), strict=True)
+        close = all(abs(max(one, now) - max(known, now)) < SAME for one, known in times)
+        return close and (self.by.client, self.by.id, self.rcs) == (other.by.client, other.by.id, other.rcs)
+
+    def text(self, now: Ns, clock: Callable[[float], str] | None = None, by: str = "") -> str:
+        """In words. `clock` formats the time of day so many seconds from now; `by` names the request."""
+        by = by or named(self.by.who, self.by.client, self.by.arc)
+        rcs = ", ".join(self.rcs)
+        if self.withdrawn:
+            return f"no request waits for {rcs} any more" if self.code == "waits" else f"{by} does not end the hold"
+        left = (self.safe_until - now) / SECOND
+        yours = f"yours until {clock(left)}" if clock is not None else f"yours for {left:.0f} s"
+        yours = yours if left > 0 else "the hold may end at any time"
+        if self.code == "waits":
+            return f"{by} waits for {rcs}: {yours}"
+        comment = self.by.who.comment if self.by.who is not None else ""
+        yours += f" ({clean(comment)})" if comment else ""
+        away = (self.begins or now) - now
+        date = clock(away / SECOND) if clock is not None else f"in {away / SECOND:.0f} s"
+        date = f" from {date}" if clock is not None else f" {date}"
+        date = date if away > 0 else " now"
+        what = f"maintenance of {rcs} by {by}" if self.code == "maintenance" else f"{by} has booked {rcs}"
+        return f"{what}{date}: {yours}"
+
+
+class NoticeTracker:
+    """What the holder of one hold has been told."""
+
+    def __init__(self) -> None:
+        self._known: dict[str, HoldNotice] = {}
+        self._missing: dict[str, Ns] = {}
+
+    @property
+    def next(self) -> Ns | None:
+        """When `take` is due, without news."""
+        return min((since + WITHDRAWN_AFTER for since in self._missing.values()), default=None)
+
+    def take(self, ends: Sequence[HoldNotice], now: Ns) -> list[HoldNotice]:
+        """The notices that are new, or withdrawn."""
+        news, present = [], {end.code: end for end in ends}
+        for code, end in present.items():
+            self._missing.pop(code, None)
+            if code not in self._known or not end.is_like(self._known[code], now):
+                self._known[code] = end
+                news.append(end)
+        for code in [code for code in self._known if code not in present]:
+            if now - self._missing.setdefault(code, now) >= WITHDRAWN_AFTER:
+                del self._missing[code]
+                news.append(self._known.pop(code)._replace(withdrawn=True))
+        return news
