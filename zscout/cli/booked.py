@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from datetime import UTC, datetime
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 from zoneinfo import ZoneInfo
 
 import click
@@ -19,7 +19,7 @@ from zscout.cli.common import F, Failed, Parsed
 from zscout.cli.dates import date_words, parse_zone, span_words
 from zscout.cli.ownership import User
 from zscout.config.strict import BadInput, quoted
-from zscout.keyexpr import host_in, of_host
+from zscout.keyexpr import host_in, matcher, of_host
 from zscout.messages import BookedDate, BookingsAsk, BookingsTold, BookingView, Correction
 from zscout.terminal import clean, clock, span
 
@@ -135,6 +135,43 @@ def coming(told: BookingsTold | None) -> dict[str, str]:
         for rc in (date.bound.get(need, need) for need in booking.needs)
     ]
     return {rc: words for _, rc, words in sorted(found, reverse=True)}
+
+
+class NextDate(NamedTuple):
+    """The next date of a booking, or of maintenance, for which a device is kept; times in seconds from now."""
+
+    rc: str
+    booking: str
+    owner: str
+    maintenance: bool
+    begins_in: float
+    ends_in: float | None
+    """None: maintenance that lasts until it is cancelled."""
+
+    def __str__(self) -> str:
+        begins = f"from {clock(self.begins_in)}" if self.begins_in > 0 else "now"
+        ends = "until it is cancelled" if self.ends_in is None else f"to {clock(self.ends_in, at_latest=True)}"
+        what = "in maintenance" if self.maintenance else "booked"
+        return clean(f"{self.rc} is {what} by {self.owner} ({self.booking}) {begins} {ends}")
+
+
+def next_dates(told: BookingsTold | None, needs: Iterable[str], own: str = "") -> list[NextDate]:
+    """The next date of each device that these needs mean, without that which the request `own` (`<host>/<client>/<id>`)
+    has taken up; the earliest first."""
+    meets, found = [matcher(need) for need in needs], dict[str, NextDate]()
+    if told is None:
+        return []
+    for booking in told.bookings:
+        for date in booking.dates if not booking.broken else ():
+            if date.state not in ("open", "taken") or date.end <= told.time or (own and date.arc == own):
+                continue
+            begins, ends = date.start - told.time, None if booking.lasting else date.end - told.time
+            rcs = booking.maintained or [date.bound.get(need, need) for need in booking.needs]
+            for rc in rcs:
+                later = rc in found and found[rc].begins_in <= begins
+                if not later and any(meet(rc) for meet in meets):
+                    found[rc] = NextDate(rc, booking.name, whose(booking), booking.maintenance, begins, ends)
+    return sorted(found.values(), key=lambda date: (date.begins_in, date.rc))
 
 
 def explained(refused: RequestRefused) -> Exception:

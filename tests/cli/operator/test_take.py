@@ -25,7 +25,7 @@ def test_a_yes_at_the_terminal_takes_and_ctrl_c_gives_back(fleet: CliFleet) -> N
     survey = fleet.holder("survey", "robot/a", "robot/b", "--priority", "3")
     with fleet.terminal("take", "robot/a", "--reason", "the gripper\x1b is stuck") as terminal:
         shown = terminal.until("Take robot/a? [y/N] ")
-        assert f"operator preempts {own('survey')}, priority 3, since " in shown
+        assert f"operator takes over from {own('survey')}, priority 3, since " in shown
         assert ": robot/a, robot/b" in shown
         terminal.press("y\n")
         terminal.until("operator holds robot/a: yours for ")
@@ -74,7 +74,7 @@ def test_who_is_asked_sees_whom_it_takes_from_when_the_json_goes_elsewhere(fleet
     script = f'exec {shlex.join(COMMAND)} take robot/a --json > "{out}"'
     with Terminal(command=("sh", "-c", script), env=fleet.lab.env) as terminal:
         shown = terminal.until("Take robot/a? [y/N] ")
-        assert f"operator preempts {own('survey')}, priority 0, since " in shown
+        assert f"operator takes over from {own('survey')}, priority 0, since " in shown
         assert "{" not in shown
         assert [event["event"] for event in events(out.read_text())] == ["preview"]
         terminal.press("y\n")

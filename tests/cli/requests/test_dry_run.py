@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterator
 
 import pytest
@@ -55,3 +56,25 @@ def test_status_and_why_tell_when_a_waiting_one_may_start(fleet: CliFleet) -> No
     finally:
         end(waiting)
         end(mine)
+
+
+def test_the_next_booking_of_each_device_is_said_beforehand_and_at_the_grant(fleet: CliFleet) -> None:
+    done = fleet.zscout("book", "robot/b", "--at", "in 2h", "--for", "1h", "--name", "calib")
+    assert done.returncode == 0, done
+    try:
+        words = r"robot/b is booked by .* \(calib\) from .* to .*"
+        dry = fleet.zscout("request", "robot/a", "robot/b", "--dry-run", "--min-runtime", "5m")
+        assert re.search(rf"^{words}$", dry.stdout, re.MULTILINE), dry
+        shown = json.loads(fleet.zscout("request", "robot/*", "robot/*", "--dry-run", "--json").stdout)
+        [date] = shown["dates"]
+        assert (date["rc"], date["booking"], date["maintenance"]) == ("robot/b", "calib", False)
+        assert 7000 < date["begins_in"] <= 7260
+        held = fleet.zscout("request", "robot/b", "--min-runtime", "5m", "--name", "test", "--", "sleep", "1")
+        assert held.returncode == 0, held
+        assert re.search(rf"^test: {words}$", held.stderr, re.MULTILINE), held
+        # It ends for that booking, not before its date.
+        assert re.search(r"^test: calib \(.*\) has booked robot/b from .*: yours until ", held.stderr, re.MULTILINE), (
+            held
+        )
+    finally:
+        fleet.zscout("booking", "cancel", "calib")

@@ -35,8 +35,8 @@ from zscout.terminal import clean, print_json, print_line
 async def take(needs: Any, yes: bool, no_keep: bool, name: str | None, reason: str, comment: str, **rest: Any) -> int:
     """Take devices at the fleet's operator priority, and keep them.
 
-    It prints whom it will preempt and asks on stderr; if stdin is not a terminal, add --yes. Then it waits, holds and
-    runs a COMMAND as `zscout request` does, with the same exit codes; 1 also if you did not answer y. A DEVICE is
+    It prints from whom it takes over, and asks on stderr; if stdin is not a terminal, add --yes. Then it waits, holds
+    and runs a COMMAND as `zscout request` does, with the same exit codes; 1 also if you did not answer y. A DEVICE is
     written as for `zscout request`, and refused for the same reasons (2).
 
     \b
@@ -73,8 +73,8 @@ class TakeoverCost:
             return hold_text(hold, self.priority, me)
 
         return [
-            *(f"preempts {text(hold)}: {', '.join(sorted(hold.needs))}" for hold in self.ends),
-            *(f"may preempt {text(hold)}: {', '.join(sorted(hold.needs))}" for hold in self.may_end),
+            *(f"takes over from {text(hold)}: {', '.join(sorted(hold.needs))}" for hold in self.ends),
+            *(f"may take over from {text(hold)}: {', '.join(sorted(hold.needs))}" for hold in self.may_end),
             *(f"waits for {text(hold)}: {', '.join(sorted(hold.needs))}" for hold in self.stays),
             *(
                 f"waits for one of {', '.join(f'{rc} (held by {text(hold)})' for rc, hold in some)}"

@@ -20,7 +20,7 @@ from zscout.behaviors.client.direct import DEFAULT_SETTLE, DirectHold
 from zscout.behaviors.client.hold_notices import HoldNotice
 from zscout.behaviors.client.request import HoldEnd, OpenArc
 from zscout.cli import common, completion
-from zscout.cli.booked import BOOKING
+from zscout.cli.booked import BOOKING, look, next_dates
 from zscout.cli.common import Failed
 from zscout.cli.device_words import unwell
 from zscout.cli.ownership import User, yes_option
@@ -52,6 +52,7 @@ ANSWERS: Final = 5.0
 """Seconds in which a leader answers, or the next one leads and does, with --timeout 0."""
 UNDECIDED: Final = (ReasonCode.VOTING, ReasonCode.SEARCHING)
 """How a request waits that may be granted without anything changing."""
+MAX_DATES_SHOWN: Final = 8
 LAST_WORD: Final = 0.5
 """Seconds in which the RCM's word about a hold whose time is over arrives."""
 REFRESH: Final = 1.0
@@ -222,7 +223,7 @@ async def _use(client: Client, wanted: HoldOptions, report: Report, arc: OpenArc
                 code = await _run(wanted, report, held, client)
             else:
                 with _never_suspended(report):
-                    noticing = report_notices(report, held, User.of(client))
+                    noticing = report_notices(report, held, client)
                     async with report.telling(report.follow_hold(arc)), common.beside(noticing):
                         await held.over()
     except BaseException:
@@ -280,17 +281,31 @@ def reporting_unwell(report: Report, held: Held, client: Client) -> Iterator[Non
         yield
 
 
+async def _tell_dates(report: Report, held: Held, client: Client) -> None:
+    dates = next_dates(await look(client), held.rcs, f"{client.mesh.me}/{held.arc.id}")
+    if dates:
+        lines = "\n  ".join(map(str, dates[:MAX_DATES_SHOWN]))
+        report.event("dates", f"{held.arc.name}: {lines}", dates=[date._asdict() for date in dates])
+
+
 async def report_notices(
-    report: Report, held: Held, me: User, noticed: Callable[[HoldNotice, str], object] = lambda *_: None
+    report: Report, held: Held, client: Client, noticed: Callable[[HoldNotice, str], object] = lambda *_: None
 ) -> None:
-    """Report what the hold yields to, until it is over; `noticed` is called with each notice and its words."""
+    """Report the next booking of each device, and what the hold yields to, until it is over; `noticed` is called with
+    each notice and its words."""
+    async with common.beside(_tell_dates(report, held, client)):
+        await _report_each(report, held, User.of(client), noticed)
+
+
+async def _report_each(report: Report, held: Held, me: User, noticed: Callable[[HoldNotice, str], object]) -> None:
     while (notice := await held.noticed()) is not None:
-        now, by = held.now(), request_words(notice.by.arc, notice.by.who, notice.by.client, me=me)
-        details: dict[str, Any] = {"code": notice.code, "withdrawn": notice.withdrawn, "by": notice.by}
+        now, by = held.now(), notice.by
+        words = request_words(by.arc, by.who, by.client, me=me if notice.code == "waits" else None)
+        details: dict[str, Any] = {"code": notice.code, "withdrawn": notice.withdrawn, "by": by}
         details |= {"rcs": notice.rcs, "safe": round(max(0, notice.safe_until - now) / SECOND, 3)}
         if notice.begins is not None:
             details["begins_in"] = round((notice.begins - now) / SECOND, 3)
-        text = f"{held.arc.name}: {clean(notice.text(now, clock, by))}"
+        text = f"{held.arc.name}: {clean(notice.text(now, clock, words))}"
         report.event("notice", text, **details)
         noticed(notice, text)
 
@@ -318,7 +333,7 @@ async def _run(wanted: HoldOptions, report: Report, held: Held, client: Client) 
             command.terminate(hold.ended_at)
 
     try:
-        noticing = report_notices(report, held, User.of(client), partial(_signal, command, wanted.notify_signal))
+        noticing = report_notices(report, held, client, partial(_signal, command, wanted.notify_signal))
         async with command, common.beside(_tell_who_is_old(report, held, client, direct)), common.beside(noticing):
             if direct is not None:
                 direct.watch(follow)
@@ -406,14 +421,15 @@ async def _foresee(client: Client, wanted: HoldOptions) -> int:
     foretold = await client.foresee(wanted.name, wanted.needs, **wanted.terms())
     if foretold is None:
         raise common.NobodyThere(f"the leader of fleet {client.fleet.name} did not answer; try again")
+    dates = next_dates(await look(client), wanted.needs)
     if wanted.as_json:
         found = {
             name: getattr(foretold, name)
             for name in ("starts_in", "begin_within", "preempts", "victims", "reason", "why")
         }
-        print_json({"arc": wanted.name, **found})
+        print_json({"arc": wanted.name, **found, "dates": [date._asdict() for date in dates]})
     else:
-        for line in _words(foretold, User.of(client)):
+        for line in (*_words(foretold, User.of(client)), *map(str, dates[:MAX_DATES_SHOWN])):
             print_line(clean(line))
     return 0 if foretold.starts_in is not None else wanted.own_code(1)
 

@@ -24,7 +24,6 @@ from zscout.behaviors.client.hold_notices import HoldNotice
 from zscout.behaviors.client.request import OpenArc
 from zscout.cli import common
 from zscout.cli.common import Failed
-from zscout.cli.ownership import User
 from zscout.cli.requests import token_files
 from zscout.cli.requests.options import HoldOptions
 from zscout.cli.requests.request import (
@@ -280,7 +279,7 @@ async def hold(client: Client, wanted: HoldOptions, seconds: float, follow: int 
             else:
                 starter.close()
                 _detach(wanted)
-                noticing = report_notices(report, held, User.of(client), holder.notice)
+                noticing = report_notices(report, held, client, holder.notice)
                 with reporting_unwell(report, held, client):
                     async with common.beside(noticing):
                         ending = await holder.until_over(path, followed)
