@@ -95,14 +95,14 @@ def _waiting(state: SchedulerState, arc: Arc) -> UpcomingEnd | None:
     for rc in arc.rcs:
         for rank in (rc.watchers if rc.sharable else rc.demand)[:MAX_RANKS]:
             other = state.queued[rank[-1]]
-            if (best is None or rank < best.rank) and _yields(arc, other) and _is_in_way(state, rc, arc, other):
+            if (best is None or rank < best.rank) and _yields(arc, other) and _is_in_way(rc, other):
                 best = other
                 break
     if best is None:
         return None
     reach = best.like.reach if best is chosen and best.like is not None else 0
     wanted = (rc for rc in arc.rcs if rc.sharable or rc.bit & (best.named_mask | reach))
-    rcs = tuple(sorted(rc.name for rc in wanted if _is_in_way(state, rc, arc, best)))
+    rcs = tuple(sorted(rc.name for rc in wanted if _is_in_way(rc, best)))
     return UpcomingEnd("waits", best.party, rcs, _until(state, arc, best))
 
 
@@ -110,13 +110,12 @@ def _yields(arc: Arc, other: Arc) -> bool:
     return other.priority >= arc.priority and not other.request.continues_from(arc.request)
 
 
-def _is_in_way(state: SchedulerState, rc: Rc, arc: Arc, other: Arc) -> bool:
+def _is_in_way(rc: Rc, other: Arc) -> bool:
     """Return True unless a sharable RC lets both hold it."""
     if not rc.sharable:
         return True
     why = other.reason
-    vetoed = why is not None and why.code is ReasonCode.VETOED and rc.name in why.rcs
-    return vetoed and not arc.preemptible_by(other, state.now)
+    return why is not None and why.code is ReasonCode.VETOED and rc.name in why.rcs
 
 
 def _until(state: SchedulerState, arc: Arc, other: Arc) -> Ns:
