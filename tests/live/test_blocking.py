@@ -431,6 +431,27 @@ def test_a_hold_that_is_kept_across_cells_ends_no_event_loop(fleet: CliFleet, tm
     assert fleet.idle("robot/a")
 
 
+def test_a_holder_learns_who_waits_by_a_callback_and_in_any_event_loop(fleet: CliFleet) -> None:
+    text = """
+    import asyncio
+    with zscout.connect() as lab, lab.hold("survey", {"robot/a": {}}, min_runtime=600) as held:
+        called = []
+        held.on_notice(called.append)
+        say("entered", held.upcoming)
+        notice = asyncio.run(held.noticed())
+        say(notice.code, notice.by.arc, notice.rcs, held.upcoming == [notice])
+        say("withdrawn", asyncio.run(held.noticed()).withdrawn, [one.by.arc for one in called][:1])
+    """
+    holder = script(fleet.lab, text)
+    assert read_until(holder, "entered") == ["entered []"]
+    waiting = fleet.start("request", "robot/a", "--name", "next")
+    try:
+        assert read_until(holder, "waits") == ["waits next ['robot/a'] True"]
+    finally:
+        end(waiting)
+    assert rest_of(holder) == ["withdrawn True ['next']"]
+
+
 def test_a_suspended_body_learns_of_the_end_when_it_runs(fleet: CliFleet, tmp_path: Path) -> None:
     taken = tmp_path / "taken"
     text = (
