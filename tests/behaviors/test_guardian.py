@@ -255,3 +255,17 @@ def test_where_proc_is_hidden_its_group_is_ended_and_what_left_it_is_named(own_s
             os.kill(pid_in(tmp_path / "child"), signal.SIGKILL)
         assert run.hears_rest() == ["gone"]
         assert not lives(pid_in(tmp_path / "child"))
+
+
+@pytest.mark.live
+def test_a_signal_waits_until_the_command_catches_it(tmp_path: Path) -> None:
+    script = "echo begun; read go < $0/go; trap 'echo caught; exit 3' USR1; while :; do sleep 0.01; done"
+    os.mkfifo(tmp_path / "go")
+    with guarded(*shell(tmp_path, script), until=now() + round(HANG * SECOND)) as command:
+        assert command.hears().startswith("started ")
+        assert command.out.readline() == "begun\n"
+        command.say(f"signal {int(signal.SIGUSR1)}")
+        with (tmp_path / "go").open("w") as go:
+            go.write("go\n")
+        assert command.out.readline() == "caught\n"
+        assert command.hears_rest() == ["exited 3", "gone"]

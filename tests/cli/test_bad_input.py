@@ -49,6 +49,8 @@ request robot/a sleep 5 | device "sleep" is not valid; write kind/name, as in ro
 request robot/a --priority high | --priority: "high" is not a whole number
 request robot/a --priority 1.5 | --priority: "1.5" is not a whole number
 request robot/a --again | --again repeats a command; add one after --
+request robot/a --notify-signal USR1 | --notify-signal is for a command; add one after --
+request robot/a --notify-signal KILL -- true | --notify-signal: "KILL" is not a signal that a command can catch
 request robot/a --min-runtime never | --min-runtime: "never" is not a duration
 request robot/a --min-runtime 0 | --min-runtime must be positive, and is 0; write more than 0, at most 3660 d
 request robot/a --for 1h | there is no option --for; did you mean --min-runtime or --release-after? (see zscout request
