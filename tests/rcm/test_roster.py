@@ -7,7 +7,7 @@ from msgspec import structs
 
 from zscout.config.fleet import default_fleet
 from zscout.keyexpr import Keys, Role, Token
-from zscout.messages import RcState
+from zscout.messages import Problem, RcState
 from zscout.rcm import roster
 from zscout.rcm.admission import Admission
 from zscout.rcm.authority import Authority
@@ -20,8 +20,11 @@ from zscout.scheduling.model import ClientLost
 from zscout.types import SECOND, Term
 
 
-def a_roster(lease: float = 1.0) -> Roster:
-    fleet, term = default_fleet(), Term(1, "rcm")
+OWN = Term(1, "rcm")
+
+
+def a_roster(lease: float = 1.0, term: Term = OWN) -> Roster:
+    fleet = default_fleet()
     fleet = structs.replace(fleet, mesh=structs.replace(fleet.mesh, lease=lease))
     admission = Admission(Authority(fleet), Places("lab", None, term))
     return Roster(Keys("lab"), "leader", fleet, term, ExpectedDevices({}), admission, lambda _: None, 0)
@@ -83,3 +86,18 @@ def test_an_rc_speaks_for_itself_alone() -> None:
         assert members.answered(1, back, structs.replace(other, health="broken"), None) == Outbox()
         assert not members.is_known("no name")
     assert members.answered(1, back, structs.replace(state, health="broken"), None).events
+
+
+@pytest.mark.parametrize(("known", "above"), [(1, "leader"), (10**9 - 5, None)])
+def test_a_term_refused_as_absurd_is_asked_for_again_above_the_other(known: int, above: str | None) -> None:
+    """An RC or client that comes late may have heard a leader of a much lower term a moment ago."""
+    members = a_roster(term=Term(10**9, "rcm"))
+    refused = Problem("old_term", "obeys another", Term(known, "before"))
+    [promise] = members.rc_token(0, Token("desk", Role.RC, "robot/a", "desk-1"), alive=True).questions
+    members.client_token(0, token(1, "desk"), alive=True)
+    [listing] = members.ask_requests(0, "desk/c1").questions
+    assert [asked.message.above for asked in (promise, listing)] == [None, None]
+    for asked in (promise, listing):
+        members.answered(0, asked, None, refused)
+    again = members.tick(SECOND).questions
+    assert [(asked.message.promise, asked.message.above) for asked in again] == [(members.term, above)] * 2

@@ -294,3 +294,15 @@ def test_the_first_gap_between_dates_is_found_by_a_look_at_each_once_or_twice(mo
     looked = 0
     assert Reservations(core._state).starts == [(48 + 2 * count - 1) * hour]
     assert count <= looked < 2 * count
+
+
+@pytest.mark.parametrize("by", [10 * SECOND, -3 * SECOND], ids=["put back", "put forward"])
+def test_the_date_of_an_absent_booking_follows_a_step_of_the_clock(by: Ns) -> None:
+    """A leader that restarted alone may go by a wrong clock at first, and may not know of the booking."""
+    core = Core(Adaptive())
+    mine = ArcRequest("mine", "h/c", {"robot/a": {}}, 0, SECOND, booking="b@5", not_before=5 * SECOND)
+    core.handle(0, RcJoined("robot/a", sharable=False), LeadTaken(Term(1, "x")), Requested(mine))
+    core.handle(SECOND, Dates((), moved=by))
+    before = core.handle(5 * SECOND + by - 1, Tick())
+    assert not [effect for effect in before if isinstance(effect, Granted)]
+    assert [effect.arc for effect in core.handle(5 * SECOND + by, Tick()) if isinstance(effect, Granted)] == ["mine"]

@@ -402,7 +402,7 @@ class Roster:
             return
         absent = message is None and problem is None
         self._out.suspicions.append((silent, absent and client in self.clients))
-        self._set(self._timing.rebuild, _Due.AGAIN, Question(Why.REQUESTS, "", 0, client=client))
+        self._set_again(Question(Why.REQUESTS, "", 0, client=client), problem)
 
     def _lose_client(self, client: ClientId) -> None:
         self._unshown.pop(client, None)
@@ -597,7 +597,7 @@ class Roster:
             return
         if not _is_of(state, token) or state.term < self.term:  # a report from before the promise
             # An answer without a promise can come at once, again and again: a token may outlive its RC.
-            self._set(self._timing.rebuild, _Due.AGAIN, Question(Why.PROMISE, "", 0, token=token))
+            self._set_again(Question(Why.PROMISE, "", 0, token=token), problem)
         elif any(holder.grant.term != self.term for holder in state.holders):
             # A hold that all RCs of its gang report continues: they join together.
             self._hold_up(state, patient=True)
@@ -767,17 +767,23 @@ class Roster:
     def _ask(self, why: Why, key: str, **how: Any) -> None:
         self._out.questions.append(Question(why, key, self._timing.rebuild / SECOND, **how))
 
-    def _ask_rc(self, why: Why, token: Token) -> None:
-        message = RcAsk(promise=self.term, instance=token.instance)
+    def _set_again(self, question: Question, problem: Problem | None) -> None:
+        """Ask again after `rebuild`. An RC or client that refused this term as absurd is asked to go above its own."""
+        refused = None if problem is None else problem.term
+        above = self.sight.me if refused is not None and disbelieved(self.term, refused) else None
+        self._set(self._timing.rebuild, _Due.AGAIN, question._replace(message=RcAsk(above=above)))
+
+    def _ask_rc(self, why: Why, token: Token, *, above: HostName | None = None) -> None:
+        message = RcAsk(promise=self.term, instance=token.instance, above=above)
         self._ask(why, self._keys.rc_state(token.name), message=message, kind=RcState, token=token)
 
-    def _ask_promise(self, token: Token) -> None:
+    def _ask_promise(self, token: Token, *, above: HostName | None = None) -> None:
         if self._is_wanted(self._rcs[token.name], token):
-            self._ask_rc(Why.PROMISE, token)
+            self._ask_rc(Why.PROMISE, token, above=above)
 
-    def _ask_client(self, client: ClientId) -> None:
+    def _ask_client(self, client: ClientId, *, above: HostName | None = None) -> None:
         if client in self.clients or client in self._unshown:
-            key, message = self._keys.requests(client_of(client)), RcAsk(promise=self.term)
+            key, message = self._keys.requests(client_of(client)), RcAsk(promise=self.term, above=above)
             self._ask(Why.REQUESTS, key, message=message, kind=ClientRequests, client=client)
         else:
             self._asked.discard(client)
@@ -785,9 +791,9 @@ class Roster:
 
     def _ask_again(self, asked: Question) -> None:
         if asked.why is Why.REQUESTS:
-            self._ask_client(asked.client)
+            self._ask_client(asked.client, above=asked.message.above)
         elif asked.why is Why.PROMISE and asked.token is not None:
-            self._ask_promise(asked.token)
+            self._ask_promise(asked.token, above=asked.message.above)
         elif not self._probed[asked.key] or self._is_seen(asked):
             del self._probed[asked.key]
             self._suspect(asked.key, so=False)

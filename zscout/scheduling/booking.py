@@ -90,11 +90,13 @@ class BookingState(StrEnum):
 class Dates(Struct, frozen=True):
     """All that is booked, best-ranked first: of what can't all be kept the first stands, and the others are in
     conflict. What is missing is unbooked; at present only, if it is `forgotten`. `more`: these are a part, and nothing
-    is judged before all are sent."""
+    is judged before all are sent. `moved`: the step in ns of all dates since the last of these events, which the dates
+    of ARCs follow whose bookings are missing."""
 
     ranked: tuple[Booking, ...]
     forgotten: frozenset[str] = frozenset()
     more: bool = False
+    moved: Ns = 0
 
 
 class Booked(Struct, frozen=True):

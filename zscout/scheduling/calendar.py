@@ -120,6 +120,8 @@ class Calendar:
                 self.book(booking)
                 self._unjudged.add(booking.id)
             return
+        if dates.moved:
+            self._move_waiting(dates.moved)
         state, wanted = self._state, {booking.id: booking for booking in dates.ranked}
         for name in [name for name in state.claims if name not in wanted]:
             self.unbook(name, at_present=name in dates.forgotten)
@@ -204,6 +206,13 @@ class Calendar:
             self._wait_again(claim.arc, start)
         if claim.arc.hold is None:
             self.expire()
+
+    def _move_waiting(self, by: Ns) -> None:
+        """Follow a step of the clock with the dates of ARCs whose bookings are absent or taken."""
+        for arc in chain.from_iterable(self._wanting.values()):
+            arc.take(replace(arc.request, not_before=arc.request.not_before + by))
+            if arc.hold is None:
+                self._wait_again(arc, arc.request.not_before)
 
     def take_up(self, booking: str, arc: Arc) -> None:
         """Let a waiting or running ARC take its booking up, now or once that is there and open. The ARC waits for

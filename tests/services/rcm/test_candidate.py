@@ -286,6 +286,22 @@ async def test_a_leader_goes_above_what_somebody_whom_it_sees_obeys(who: str) ->
     await until(lambda: candidate.rcm and candidate.rcm.term > far)
 
 
+async def test_a_device_that_was_cut_off_follows_a_leader_far_above_its_term_at_once() -> None:
+    """It heard the leader of another term within the hold lease, and refuses the first question."""
+    fleet = FakeFleet("h1")
+    robot, candidate = await a_robot(fleet), fleet.candidate("h1")
+    await until(lambda: candidate.rcm and candidate.rcm.core.status().rcs)
+    fleet.network.isolate(robot.mesh)
+    cut_at = robot.mesh.now()
+    far = Term(10**9, "mad")
+    fleet.rc("robot/b", term=far)
+    await until(lambda: candidate.rcm and candidate.rcm.term > far)
+    fleet.network.heal()
+    await until(lambda: candidate.rcm and "robot/a" in {rc.name for rc in candidate.rcm.core.status().rcs if rc.present})
+    assert robot.holds.term > far
+    assert robot.mesh.now() - cut_at < fleet.fleet.timing.hold_lease
+
+
 async def test_of_two_that_stand_at_once_one_leads_and_the_other_does_not(monkeypatch: pytest.MonkeyPatch) -> None:
     """It would depose the first with a term above, and the RCs would be led by who may fail next."""
     fleet = FakeFleet("h1", "h2")

@@ -214,6 +214,17 @@ def test_who_may_be_cut_off_waits(others: list[bool], own: bool, lost: list[str]
         assert not seen.must_wait(hosts(*others), own, LATER + SILENCE)
 
 
+def test_while_links_return_one_host_that_sees_a_leader_is_enough() -> None:
+    seen = election()
+    seen.candidate("c", alive=True, now=START)
+    seen.candidate("c", alive=False, now=START)
+    assert not seen.must_wait(hosts(True, False), False, LATER)
+    seen.candidate("c", alive=True, now=LATER)
+    assert seen.must_wait(hosts(True, False), False, LATER)
+    assert not seen.must_wait(hosts(False, False), False, LATER)
+    assert not seen.must_wait(hosts(True, False), False, LATER + SILENCE + 1)
+
+
 def test_who_waited_alone_once_does_so_anew_after_a_leader_was_seen() -> None:
     seen = election()
     seen.candidate("c", alive=True, now=START)

@@ -98,6 +98,8 @@ class BookedDates:
         self._dated_by: Ns = clock.at(0)
         """By how much fleet time is ahead of the host's clock for all dates in the core, so that what follows upon
         another does so there as well."""
+        self._moved: Ns = 0
+        """The step of the dates in the core that `reconcile` has not sent yet."""
 
     @property
     def time(self) -> float:
@@ -271,7 +273,8 @@ class BookedDates:
         before, self._sent = self._sent, frozenset(booking.id for booking in ranked)
         # What is only forgotten here, as it could be kept nowhere, another host may have.
         gone = before - self._sent
-        event = Dates(ranked, frozenset(name for name in gone if self.date(name) is None))
+        event = Dates(ranked, frozenset(name for name in gone if self.date(name) is None), moved=self._moved)
+        self._moved = 0
         for name in gone:
             self._conflicts.pop(name, None)
             self._danger.pop(name, None)
@@ -288,6 +291,7 @@ class BookedDates:
         now, ahead = self.now, self.clock.at(self.now) - self.now
         if ahead == self._dated_by:
             return False
+        self._moved += self._dated_by - ahead
         self._dated_by = ahead
         skipped, over = dict[str, list[Date]](), dict[str, list[Instant]]()
         for booking, arc in self._core.bookings() if settled else ():

@@ -170,12 +170,13 @@ class Election:
         """Return True if RCs show a leader: most other hosts do (`views`), or this host (`own`).
 
         This host's RCs count only if no other host answers: they see what it sees. If this host may be cut off,
-        the candidate waits for one more silence."""
+        the candidate waits for one more silence. While links return, one host that shows a leader is enough: the
+        leader's own link may be the next."""
         sights = others.values()
         if others:
             self._alone_since = None
             yields = now < self._yields_until and (self.heard_within(self.silence, now) or any(sights))
-            return yields or sum(sights) * 2 > len(sights)
+            return yields or sum(sights) * 2 > len(sights) or (any(sights) and self._is_back(now))
         if (
             self._led
             and self._deposed is not None
@@ -197,8 +198,11 @@ class Election:
 
     def links_return(self, now: Ns) -> bool:
         """Whether links of this host may be coming back, one after the other."""
-        returned = self._returned is not None and now - self._returned <= self.silence
-        return returned or self._was_away(now)
+        return self._is_back(now) or self._was_away(now)
+
+    def _is_back(self, now: Ns) -> bool:
+        """Return True if a host whose candidate had gone came back within a silence."""
+        return self._returned is not None and now - self._returned <= self.silence
 
     def heard_within(self, span: Ns, now: Ns) -> bool:
         """Whether a leader that counts was seen or heard so lately."""
