@@ -57,7 +57,8 @@ BAD = {
     'arm\nport = "x"\nspeed = 101': "rc[0] (arm/a): speed is above 100, which bends it; write less; correct it",
     'arm\nport = "gone"': "rc[0].driver (arm/a): zscout_arm.Arm can't be made: KeyError: 'gone'; fix that package, or",
     "bare\nport = 1": "rc[0].port (arm/a): unknown key; known here: none",
-    'odd\nport = "x"': "rc[0].driver (arm/a): the options of zscout_arm.Odd can't be read: rc[0].port has an unsupported type",
+    'odd\nport = "x"': "rc[0].driver (arm/a): the options of zscout_arm.Odd can't be read: rc[0].port has an "
+    "unsupported type",
     "nodriver": "rc[0].driver (arm/a): zscout_arm:NoDriver of package zscout_arm 1.0 is not a driver; "
     "name a subclass of",
     "amr": 'rc[0].driver (arm/a): no driver "amr" is installed here; did you mean "arm"? Install the package',

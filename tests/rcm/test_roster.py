@@ -19,7 +19,6 @@ from zscout.rcm.steps import Outbox, Why
 from zscout.scheduling.model import ClientLost
 from zscout.types import SECOND, Term
 
-
 OWN = Term(1, "rcm")
 
 

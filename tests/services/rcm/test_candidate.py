@@ -297,7 +297,9 @@ async def test_a_device_that_was_cut_off_follows_a_leader_far_above_its_term_at_
     fleet.rc("robot/b", term=far)
     await until(lambda: candidate.rcm and candidate.rcm.term > far)
     fleet.network.heal()
-    await until(lambda: candidate.rcm and "robot/a" in {rc.name for rc in candidate.rcm.core.status().rcs if rc.present})
+    await until(
+        lambda: candidate.rcm and "robot/a" in {rc.name for rc in candidate.rcm.core.status().rcs if rc.present}
+    )
     assert robot.holds.term > far
     assert robot.mesh.now() - cut_at < fleet.fleet.timing.hold_lease
 
