@@ -101,20 +101,20 @@ def answering(reply: bytes) -> Iterator[str]:
 @pytest.mark.parametrize(
     ("path", "words"),
     [
-        ("401", "it wants a user and password (401)"),
-        ("403", "it forbids this to everybody, or to this user (403)"),
+        ("401", "it requires a user and password (401)"),
+        ("403", "access is forbidden, perhaps only for this user (403)"),
         ("404", "it has no such page; is the path right? (404)"),
-        ("503", "it is busy, or serves others and has no place left (503)"),
-        ("500", "it failed inside (500)"),
+        ("503", "it is busy, or has no capacity left for another viewer (503)"),
+        ("500", "internal error of the server (500)"),
         ("418", "it refuses this (418)"),
         ("599", "it failed (599)"),
-        ("loop", "it redirects without an end, or to nowhere (302)"),
-        ("text/html", "it sends a page of HTML, not pictures; is that its page to log in?"),
+        ("loop", "it redirects endlessly, or without a target (302)"),
+        ("text/html", "it sends an HTML page, not pictures; is it a login page?"),
         ("application/json", "it sends application/json, not pictures"),
         ("image/jpeg", None),
         ("multipart/x-mixed-replace", None),
-        ("basic", "it wants a user and password (401)"),
-        ("digest", "it wants a user and password (401)"),
+        ("basic", "it requires a user and password (401)"),
+        ("digest", "it requires a user and password (401)"),
     ],
 )
 def test_each_failure_of_a_server_has_its_own_words(pages: str, path: str, words: str | None) -> None:
@@ -132,8 +132,8 @@ def test_what_is_no_server_of_pictures_has_its_own_words(pages: str) -> None:
     with socket.socket() as bound, answering(b"") as closes, answering(b"220 ftp\r\n") as other:
         bound.bind(("127.0.0.1", 0))
         for url, words in (
-            ("http://no-such-camera.invalid/", "there is no such host"),
-            ("rtsp://no-such-camera.invalid/", "there is no such host"),
+            ("http://no-such-camera.invalid/", "unknown host"),
+            ("rtsp://no-such-camera.invalid/", "unknown host"),
             (f"http://127.0.0.1:{bound.getsockname()[1]}/", "nothing listens there"),
             (f"rtsp://127.0.0.1:{bound.getsockname()[1]}/", "nothing listens there"),
             (f"tcp://127.0.0.1:{bound.getsockname()[1]}", "nothing listens there"),
@@ -147,7 +147,7 @@ def test_what_is_no_server_of_pictures_has_its_own_words(pages: str) -> None:
         ):
             found = why_closed(url, TIMEOUT)
             assert found is not None, url
-            assert words in found or (words == "there is no such host" and "looked up" in found), url
+            assert words in found or (words == "unknown host" and "name lookup" in found), url
 
 
 def test_a_server_that_says_nothing_has_its_own_words() -> None:
@@ -161,9 +161,9 @@ def test_a_server_that_says_nothing_has_its_own_words() -> None:
     ("status", "codec", "words"),
     [
         (200, "JPEG", None),
-        (401, "JPEG", "it wants a user and password (401)"),
+        (401, "JPEG", "it requires a user and password (401)"),
         (404, "JPEG", "it has no such page; is the path right? (404)"),
-        (453, "JPEG", "it has no bandwidth left for one more viewer (453)"),
+        (453, "JPEG", "it has no bandwidth left for another viewer (453)"),
         (200, "AV1", "it sends AV1, which can't be decoded here; set the camera to H.264, H.265 or MJPEG"),
     ],
 )
@@ -177,7 +177,7 @@ def test_a_user_signs_in_to_rtsp_before_anything_is_called_wrong() -> None:
         url = server.url.replace("//", "//a:s%3A1@")
         assert why_closed(url, TIMEOUT) == "it has no such page; is the path right? (404)"
         assert why_closed(url.replace("s%3A1", "wrong"), TIMEOUT) == "it refuses this user and password (401)"
-        assert why_closed(server.url, TIMEOUT) == "it wants a user and password (401)"
+        assert why_closed(server.url, TIMEOUT) == "it requires a user and password (401)"
 
 
 def colour(number: int) -> NDArray[np.uint8]:

@@ -83,13 +83,13 @@ def test_another_user_is_named_and_stops_nobody(tmp_path: Path, caplog: pytest.L
             pass
         (line,) = {record.message for record in caplog.records}
         user = user_name(NOBODY)
-        assert line.startswith(f"robot/a: process {pid} of user {user} has its lock on this machine")
+        assert line.startswith(f"robot/a: its lock is held by process {pid} of user {user}, which is not trusted")
 
 
 @pytest.mark.live
 def test_a_name_without_a_listener_stops_nobody(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     with taken("binds"), only_here(FLEET, "anvil", "robot/a", tmp_path):
-        assert "an unknown process has its lock" in caplog.text
+        assert "its lock is held by an unknown process" in caplog.text
 
 
 def test_root_is_believed_by_everybody(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

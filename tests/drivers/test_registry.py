@@ -61,8 +61,8 @@ BAD = {
     "unsupported type",
     "nodriver": "rc[0].driver (arm/a): zscout_arm:NoDriver of package zscout_arm 1.0 is not a driver; "
     "name a subclass of",
-    "amr": 'rc[0].driver (arm/a): no driver "amr" is installed here; did you mean "arm"? Install the package',
-    "sonar": 'rc[0].driver (arm/a): no driver "sonar" is installed here; install the package that brings it into this '
+    "amr": 'rc[0].driver (arm/a): no driver "amr" is installed here; did you mean "arm"? Install its package',
+    "sonar": 'rc[0].driver (arm/a): no driver "sonar" is installed here; install its package into this '
     'environment, or write one of "arm", "bare", "broken", "capacity", "command", "exclusive", "framegrabber", ',
     "broken": "rc[0].driver (arm/a): broken:Arm of package broken 1.0 can't be loaded: ModuleNotFoundError: No module "
     "named 'no_such_vendor'; fix that package, or install its needs; --log-level debug shows more",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from tests.drivers.rcs import TERM
-from zscout.drivers.use import MAX_ENDED, TOLD_FOR, UseCounter
+from zscout.drivers.use import MAX_ENDED, PUBLISH_ENDED_FOR, UseCounter
 from zscout.messages import MAX_USES, HoldUse, RcState, decode, encode
 from zscout.types import SECOND, Grant, Ns
 
@@ -26,7 +26,7 @@ def held() -> UseCounter:
 
 
 def told(use: UseCounter, now: float) -> dict[int, float]:
-    return {one.grant.seq: one.seconds for one in use.told(at(now))}
+    return {one.grant.seq: one.seconds for one in use.report(at(now))}
 
 
 def test_a_hold_without_a_command_was_not_used() -> None:
@@ -53,9 +53,9 @@ def test_nothing_counts_after_the_end() -> None:
     use = held()
     use.carried_out(grant(), at(1), at(2))
     use.hold_ended(grant(), at(5))
-    use.news = False
+    use.unpublished = False
     use.carried_out(grant(), at(4), at(8))
-    assert use.news
+    assert use.unpublished
     assert told(use, 9) == {1: 4.0}
     use.carried_out(grant(7), at(4), at(8))
     late = held()
@@ -78,11 +78,11 @@ def test_all_of_a_direct_hold_is_used_from_its_beginning_at_the_driver() -> None
 def test_only_an_end_is_news() -> None:
     use = held()
     use.carried_out(grant(), at(1), at(2))
-    assert not use.news
+    assert not use.unpublished
     use.hold_ended(grant(7), at(3))
-    assert not use.news
+    assert not use.unpublished
     use.hold_ended(grant(), at(3))
-    assert use.news
+    assert use.unpublished
 
 
 def test_what_is_over_is_told_for_a_while_and_not_without_bound() -> None:
@@ -91,13 +91,13 @@ def test_what_is_over_is_told_for_a_while_and_not_without_bound() -> None:
         use.hold_began(grant(number))
         use.hold_ended(grant(number), at(number))
     last = 2 * MAX_ENDED - 1
-    assert ([*told(use, last - 1)][-1], len(told(use, last))) == (last, TOLD_FOR // SECOND + 1)
-    assert told(use, last + TOLD_FOR / SECOND + 1) == {}
+    assert ([*told(use, last - 1)][-1], len(told(use, last))) == (last, PUBLISH_ENDED_FOR // SECOND + 1)
+    assert told(use, last + PUBLISH_ENDED_FOR / SECOND + 1) == {}
     for number in range(1_000):
         use.hold_began(grant(number))
     for number in range(MAX_ENDED + 5):
         use.hold_ended(grant(number), at(500))
-    words = use.told(at(500))
+    words = use.report(at(500))
     assert len(words) == MAX_USES
     assert [word.grant.seq for word in words[:MAX_ENDED]] == [*range(5, MAX_ENDED + 5)]
     state = RcState("robot/x", "host", "i", sharable=True, used=words)

@@ -1,14 +1,13 @@
-"""What a radio's line can carry: its vote, and the bucket that keeps each holder to its share. Pure.
+"""The capacity of a radio's line: the vote, and the token bucket that limits each holder to its share. Pure.
 
-A holder asks for `command_rate` packets a second of at most `packet_size` bytes. Its packets pass a token
-bucket with room for one packet: in any `t` seconds at most `L (1 + r t)` bytes of it come out (`L` bytes a
-packet, `r` packets a second). They then wait in one queue, first come first served, before a line of `C`
-bytes a second. Halts and stops go ahead of them. These and everything that is sent again together keep to a
-bucket of their own of `U` bytes, filled at `s C`: the reserve.
+A holder requests `command_rate` packets per second of at most `packet_size` bytes. Its packets pass a token bucket of
+one packet: at most `L (1 + r t)` bytes come out in any `t` seconds (`L` bytes per packet, `r` packets per second). They
+then wait in a common queue, first come first served, for a line of `C` bytes per second. Halts and stops go ahead of
+them. Halts, stops and repeats together keep to a separate bucket of `U` bytes, filled at `s C`: the reserve.
 
 The delay bound (network calculus; Le Boudec and Thiran, "Network Calculus", section 1.4: FIFO server, leaky
-buckets). Let a packet enter the queue at `t`, be through the line at `t + d`, and let the line have been busy
-since `b <= t`. What it carried in between came in after `b`, or was under way then (`M` bytes, one packet):
+buckets). Let a packet enter the queue at `t` and leave the line at `t + d`, and let the line have been busy since
+`b <= t`. The bytes carried in between came in after `b`, or were under way at `b` (`M` bytes, one packet):
 
     C (t + d - b)  <=  M + sum L + sum r L (t - b) + U + s C (t + d - b)
 
@@ -16,11 +15,11 @@ If `sum r L <= C (1 - s)`, which is the first half of the vote, then it follows 
 
     d  <=  (M + sum L + U) / (C (1 - s))
 
-The second half is that this is within `bound`. `U` has room for one halt for each holder. Both sums grow with
-every holder, so what is accepted is accepted of every part. A holder that joins while the line is busy begins
-with an empty bucket, so the sums hold across changes of holders, too.
+The second half is that this is within `bound`. `U` has room for a halt of each holder. Both sums grow with every
+holder, so every subset of accepted holders is accepted. A holder that joins while the line is busy begins with an empty
+bucket, so the sums hold across changes of holders, too.
 
-The promise is suspended while more than `U` bytes of halts and stops come at once: they go first even so."""
+The bound does not hold while more than `U` bytes of halts and stops come at once: they still go first."""
 
 from __future__ import annotations
 
@@ -37,21 +36,21 @@ from zscout.types import SECOND, Ns
 BITS_PER_BYTE: Final = 10
 """On the line: a start bit, eight of data, a stop bit."""
 RESERVE: Final = Fraction(1, 10)
-"""Share of the line that is kept for halts, stops and what is sent again."""
+"""Share of the line reserved for halts, stops and repeats."""
 DEFAULT_RATE: Final = Fraction(5)
-"""Packets a second, of the full size."""
+"""Packets of full size per second."""
 MAX_RATE: Final = Fraction(5_000)
-"""Bytes a second that are counted on at most: a faster line is not what holds commands up."""
+"""Bytes per second assumed at most: a faster line is not the bottleneck."""
 
 
 def line_rate(baud: int) -> Fraction:
-    """Bytes a second that are counted on at `baud` bits a second."""
+    """Bytes per second assumed for a line of `baud` bits per second."""
     return min(Fraction(baud, BITS_PER_BYTE), MAX_RATE)
 
 
 @dataclass(frozen=True, slots=True)
 class Share:
-    """What one holder may send: `rate` packets a second of at most `size` bytes."""
+    """A holder's share: `rate` packets per second of at most `size` bytes."""
 
     rate: Fraction
     size: Fraction
@@ -62,18 +61,18 @@ class Share:
 
 
 def room(rate: Fraction) -> Fraction:
-    """Bytes a second that the holders of a line of `rate` bytes a second may send."""
+    """Bytes per second for all holders of a line of `rate` bytes per second."""
     return rate * (1 - RESERVE)
 
 
 def default_rate(rate: Fraction) -> Fraction:
-    """Packets a second that a holder books on such a line who does not say."""
+    """Packets per second on a line of `rate` bytes per second for a holder that requests no `command_rate`."""
     return min(DEFAULT_RATE, room(rate) / MAX_PACKET)
 
 
 def share_of(params: Mapping[str, Decimal], default: Fraction = DEFAULT_RATE) -> Share:
-    """The share that bandwidth parameters ask for; `default` is the rate where they have none. Raises ValueError with a
-    reason in words."""
+    """The share in bandwidth parameters; `default`: the rate if they have none. Raises ValueError with a reason for
+    people."""
     amounts = exact_amounts(params)
     rate = amounts.get("command_rate", default)
     size = amounts.get("packet_size", Fraction(MAX_PACKET))
@@ -83,19 +82,19 @@ def share_of(params: Mapping[str, Decimal], default: Fraction = DEFAULT_RATE) ->
 
 
 def urgent_burst(holders: int) -> int:
-    """`U`: bytes of halts, stops and repeats that may come at once. A halt or a stop is all overhead."""
+    """`U`: bytes of halts, stops and repeats that may come at once. Halts and stops consist of overhead only."""
     return max(OVERHEAD * holders, MAX_PACKET)
 
 
 def longest_wait(rate: Fraction, shares: Iterable[Share]) -> Fraction:
-    """Seconds from when a packet enters the queue until it is through the line: the delay bound above."""
+    """The delay bound above: seconds from a packet's entry into the queue until it has left the line."""
     sizes = [share.size for share in shares]
     return (MAX_PACKET + sum(sizes) + urgent_burst(len(sizes))) / room(rate)
 
 
 def objection(rate: Fraction, bound: Fraction, shares: Iterable[Share]) -> str:
-    """Why a line of `rate` bytes a second can't carry these shares, no packet waiting longer than `bound`
-    seconds; empty if it can."""
+    """The reason why a line of `rate` bytes per second can't carry these shares with waits of at most `bound` seconds;
+    "" if it can."""
     shares = list(shares)
     most = room(rate)
     wanted = sum((share.bytes_per_second for share in shares), Fraction(0))
@@ -111,8 +110,7 @@ def objection(rate: Fraction, bound: Fraction, shares: Iterable[Share]) -> str:
 
 
 class Bucket:
-    """A token bucket of bytes, or frames, at a positive rate a second. Times are whole ns going in, exact ns
-    coming out."""
+    """A token bucket of bytes or frames with a positive rate per second. It takes whole ns and returns exact ns."""
 
     def __init__(self, size: Fraction, rate: Fraction, now: Ns, *, full: bool = True) -> None:
         self.size = size
@@ -120,15 +118,15 @@ class Bucket:
         self._full_at = now + (0 if full else size * self._period)
 
     def ready(self, needed: int) -> Fraction:
-        """When there is enough for `needed` (at most `size`)."""
+        """The time at which `needed` tokens (at most `size`) are there."""
         return Fraction(self._full_at - (self.size - needed) * self._period)
 
     def take(self, needed: int, at: Fraction | Ns) -> None:
-        """Takes `needed` out at `at`; more than there is leaves it in debt."""
+        """Remove `needed` tokens at `at`; the bucket may go into debt."""
         self._full_at = max(self._full_at, at) + needed * self._period
 
     def admits(self, needed: int, now: Ns) -> bool:
-        """Takes `needed` out if there is enough; whether there was."""
+        """Remove `needed` tokens and return True, or return False if there are not enough."""
         if self.ready(needed) > now:
             return False
         self.take(needed, now)

@@ -27,7 +27,7 @@ class DeviceCommand(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag
 
 
 class RadioDrive(DeviceCommand, frozen=True, tag="drive"):
-    """Turns a robot's wheels, each -1 to 1 of top speed, for `lasts` seconds at most."""
+    """Turn a robot's wheels, each -1 to 1 of top speed, for at most `lasts` seconds."""
 
     robot: RobotId
     left: WheelSpeed
@@ -36,21 +36,21 @@ class RadioDrive(DeviceCommand, frozen=True, tag="drive"):
 
 
 class RadioCamera(DeviceCommand, frozen=True, tag="camera"):
-    """A robot's transmitter on `channel`; 0 switches it off."""
+    """Set a robot's transmitter to `channel`; 0 switches it off."""
 
     robot: RobotId
     channel: VideoChannel
 
 
 class RadioStop(DeviceCommand, frozen=True, tag="stop"):
-    """A robot's wheels stop. `rc` is the robot RC that commands it, where no grant does."""
+    """Stop a robot's wheels. `rc`: the RC of the robot, if it commands this without a grant."""
 
     robot: RobotId
     rc: str | None = None
 
 
 class RadioHalt(DeviceCommand, frozen=True, tag="halt"):
-    """A robot's wheels stop and its transmitter goes off. `rc` as above."""
+    """Stop a robot's wheels and switch its transmitter off. `rc` as in RadioStop."""
 
     robot: RobotId
     rc: str | None = None
@@ -75,7 +75,7 @@ RobotCommand: TypeAlias = RobotDrive | RobotStop | RobotCamera
 
 
 def radio_command(do: Mapping[str, Any]) -> RadioCommand:
-    """The command of a radio. Raises Refused."""
+    """Read a command of a radio. Raises Refused."""
     order: RadioCommand = _read(do, RadioCommand, ("drive", "camera", "stop", "halt"))
     if isinstance(order, RadioStop | RadioHalt) and order.rc is not None:
         try:
@@ -86,7 +86,7 @@ def radio_command(do: Mapping[str, Any]) -> RadioCommand:
 
 
 def robot_command(do: Mapping[str, Any]) -> RobotCommand:
-    """The command of a robot. Raises Refused."""
+    """Read a command of a robot. Raises Refused."""
     order: RobotCommand = _read(do, RobotCommand, ("drive", "camera", "stop"))
     return order
 

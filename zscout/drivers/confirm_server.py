@@ -1,4 +1,4 @@
-"""One question to all RCs of a process: do they know of a grant? Each answers in its turn, as to a `confirm`."""
+"""Answers one query for all RCs of a process: whether they know a grant. Each RC answers as to a `confirm` command."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ CommandQuery: TypeAlias = IncomingQuery[Command]
 
 
 class ConfirmServer:
-    """Of one process, whose RCs stand in it while they take commands."""
+    """Serves the RCs of this process that accept commands."""
 
     def __init__(self, mesh: Mesh) -> None:
         self._mesh = mesh
@@ -23,7 +23,7 @@ class ConfirmServer:
         mesh.serve(mesh.keys.confirm_any(mesh.me.host), Confirm, self._on_confirm)
 
     def serve(self, rc: RcName, on_command: Callable[[CommandQuery], None]) -> Declaration:
-        """From now on `rc` is asked as well: `on_command` takes it as a command, and may raise Refused."""
+        """Include `rc` from now on: `on_command` handles the question as a command, and may raise Refused."""
         self._rcs[rc] = on_command
 
         def leave() -> None:
@@ -47,26 +47,26 @@ class ConfirmServer:
 
 
 class _Answers:
-    """What the RCs that are asked have answered."""
+    """Collects the RCs' answers to a query."""
 
     def __init__(self, query: IncomingQuery[Confirm], missing: int) -> None:
         self._query, self._missing = query, missing
-        self._said = Confirmed()
+        self._collected = Confirmed()
         if not missing:
-            query.answer(self._said)
+            query.answer(self._collected)
 
-    def add(self, rc: RcName, said: msgspec.Struct) -> None:
-        if isinstance(said, Problem):
-            self._said.refused[rc] = said
-        elif isinstance(said, Done):
-            self._said.done[rc] = said
+    def add(self, rc: RcName, answer: msgspec.Struct) -> None:
+        if isinstance(answer, Problem):
+            self._collected.refused[rc] = answer
+        elif isinstance(answer, Done):
+            self._collected.done[rc] = answer
         self._missing -= 1
         if not self._missing:
-            self._query.answer(self._said)
+            self._query.answer(self._collected)
 
 
 class _Part(IncomingQuery[Command]):
-    """The question to one of them."""
+    """The question to a single RC."""
 
     __slots__ = ("_answers", "_rc")
 
@@ -75,7 +75,7 @@ class _Part(IncomingQuery[Command]):
         self._answers: _Answers | None = answers
         self._rc = rc
 
-    def end(self, said: msgspec.Struct, encoded: bytes | None = None) -> None:
+    def end(self, answer: msgspec.Struct, encoded: bytes | None = None) -> None:
         answers, self._answers = self._answers, None
         if answers is not None:
-            answers.add(self._rc, said)
+            answers.add(self._rc, answer)

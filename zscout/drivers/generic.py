@@ -1,4 +1,4 @@
-"""Devices without hardware to control: a fleet can be described in TOML alone."""
+"""Drivers of devices that need no control, so that a fleet can be described in TOML alone."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from zscout.types import SECOND
 
 
 class ExclusiveDriver(Driver):
-    """A device that is held, and nothing more."""
+    """A device that can only be held."""
 
     Options: ClassVar[type] = ExclusiveRc
 
@@ -27,7 +27,7 @@ class ExclusiveDriver(Driver):
         return cls(activation=options.activation / SECOND)
 
     async def command(self, holder: Holder, do: Mapping[str, Any]) -> Any:
-        """Knows `echo`, which returns its `value`."""
+        """Supports `echo`, which returns its `value`."""
         if do.get("name") == "echo":
             return do.get("value")
         return await super().command(holder, do)
@@ -37,7 +37,7 @@ class ExclusiveDriver(Driver):
 
 
 class CapacityDriver(ExclusiveDriver):
-    """A sharable device that carries holders as long as no bandwidth parameter's sum exceeds its bound."""
+    """A sharable device that accepts holders while no sum of a bandwidth parameter exceeds its capacity."""
 
     Options = CapacityRc
     sharable = True
@@ -61,8 +61,8 @@ class CapacityDriver(ExclusiveDriver):
 
 
 class VideoDriver(Driver):
-    """A video channel, which is a frequency: any number may listen, one may transmit. Bandwidth parameter:
-    `transmitters`, 1 unless given; 0 only listens."""
+    """A video channel, which is a radio frequency: a single holder may transmit, any number may receive. Bandwidth
+    parameter: `transmitters`, 1 by default; 0 only receives."""
 
     Options = VideoRc
     sharable = True
@@ -80,7 +80,7 @@ class VideoDriver(Driver):
             if count.denominator != 1:
                 return f"{holder.arc}: transmitters is {float(count):g}; write 1, or 0 to listen only"
             if count > 1:
-                return f"{holder.arc} would transmit {count} times on it; one frequency carries one picture"
+                return f"{holder.arc} would transmit {count} times on it; a frequency carries a single picture"
             if count:
                 transmitting.append(holder)
         if len(transmitting) < 2:

@@ -1,5 +1,5 @@
-"""How large an encoded picture is, read from its head alone: pictures come from outside, and a viewer that
-decodes one makes room for as many pixels as its head says."""
+"""The size of an encoded picture, read from its head: a viewer that decodes a foreign picture allocates as many pixels
+as the head declares."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ from typing import Final
 _PNG: Final = b"\x89PNG\r\n\x1a\n"
 _PNG_END: Final = b"\x00\x00\x00\x00IEND\xaeB`\x82"
 _FRAMES: Final = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
-"""JPEG's markers of a frame (ITU-T T.81, table B.1): those with the picture's size."""
+"""JPEG's markers of a frame (ITU-T T.81, table B.1), which contain the picture's size."""
 _ALONE: Final = frozenset({0x01, *range(0xD0, 0xD8)})
 """Markers without a length."""
 _SCAN: Final = b"\xff\xda"
 MAX_SCANS: Final = 64
-"""Passes over a progressive picture: cameras make up to a dozen, and each costs a reader all pixels anew."""
+"""Passes over a progressive picture: cameras make up to a dozen, and a reader decodes all pixels in each."""
 
 
 def jpeg_size(data: bytes) -> tuple[int, int] | None:
-    """Width and height in pixels; None if this does not begin as a JPEG picture does, or has more than MAX_SCANS."""
+    """Width and height in pixels; None if `data` does not begin like a JPEG, or has more than MAX_SCANS scans."""
     if data[:2] != b"\xff\xd8" or data.count(_SCAN) > MAX_SCANS:
         return None
     at = 2
@@ -42,7 +42,7 @@ def jpeg_size(data: bytes) -> tuple[int, int] | None:
 
 
 def png_size(data: bytes) -> tuple[int, int] | None:
-    """Width and height in pixels; None if this does not begin and end as a PNG picture does."""
+    """Width and height in pixels; None if `data` does not begin and end like a PNG."""
     if len(data) < 45 or data[:8] != _PNG or data[8:16] != b"\x00\x00\x00\x0dIHDR" or data[-12:] != _PNG_END:
         return None
     width, height = struct.unpack_from(">II", data, 16)

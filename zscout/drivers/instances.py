@@ -1,8 +1,8 @@
-"""Which instance of an RC serves: two nodes may offer devices under one name, and one of them is meant.
+"""Decides which instance of an RC serves, as two nodes may offer devices under the same name.
 
-An instance that finds another one on the mesh, or that an RCM does not name, stands by: it holds nothing, answers
-nothing and keeps its token. When the one that serves has not been seen for the hold lease, and so has let go of
-everything, and then for as long as it settles, this one offers itself, and serves once an RCM names it."""
+An instance is on standby if it finds another instance on the mesh, or if the RCM names another: it holds nothing,
+answers nothing and keeps its token. When the serving instance has been gone for the hold lease, after which it holds
+nothing, plus the settling time, this instance offers itself, and serves once an RCM names it."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ log = logging.getLogger(__name__)
 class InstanceState(enum.Enum):
     SERVES = "serves"
     OFFERED = "offered"
-    """It tells its state to an RCM that may take it in."""
+    """It answers queries for its state, so that an RCM can name it."""
     STANDS_BY = "stands by"
 
 
 class Instances:
-    """Follows the instances of `rc`, of which `instance` is this one. `patience`: the seconds from when another
-    one was seen last until nobody can use its device any more."""
+    """Follows the instances of `rc`; `instance` is this one's id. `patience`: seconds after which no program can use
+    another instance's device, once that instance is gone."""
 
     def __init__(
         self,
@@ -45,14 +45,14 @@ class Instances:
         self._serves = instance
         """The instance that serves, as far as this one knows."""
         self._host: HostName | None = None
-        """Its host, if that is known."""
+        """The host of the serving instance, if known."""
         self._others: dict[str, Token] = {}
-        """The other ones that have a token."""
+        """Tokens of the other instances."""
         self._waiting: asyncio.TimerHandle | None = None
 
     @property
     def duplicate_of(self) -> str:
-        """For which one it stands by, in words; empty if it serves."""
+        """The serving instance as text, such as `robot/arm1 at bellows`; "" if this one serves."""
         if self.state is InstanceState.SERVES:
             return ""
         return f"{self._rc} at {self._host}" if self._host is not None else f"{self._rc} elsewhere"
@@ -61,13 +61,13 @@ class Instances:
         return self._mesh.watch(self._mesh.keys.alive_rc(self._rc), self._supervisor.guard(self._on_token))
 
     def begin(self) -> None:
-        """Stands by from the beginning where another host offers the RC. On its own host it is its successor."""
+        """Begin on standby if another host offers the RC. An instance on the same host is a predecessor."""
         elsewhere = [token for token in self._others.values() if token.host != self._mesh.me.host]
         if elsewhere and self.state is InstanceState.SERVES:
             self.take(min(elsewhere).instance)
 
     def take(self, named: str, host: HostName | None = None) -> None:
-        """An RCM that is obeyed names this instance, of `host` if that was said."""
+        """The obeyed RCM names the instance `named`, at `host` if given."""
         if named == self.instance:
             self._become(InstanceState.SERVES)
         elif (self._others[named].host if named in self._others else host) != self._mesh.me.host:
@@ -79,7 +79,7 @@ class Instances:
             self._become(InstanceState.STANDS_BY)
 
     def _is_at(self, host: HostName | None) -> None:
-        """The one that serves is at that host."""
+        """Note the host of the serving instance."""
         before, self._host = self._host, host
         if self.state is InstanceState.STANDS_BY and before != host:
             log.warning("%s stands by: duplicate of %s", self._rc, self.duplicate_of)

@@ -1,4 +1,4 @@
-"""Whether the last holder of an RC may have been a direct one, over restarts of the RC: if so, it settles at first."""
+"""Remembers over restarts of an RC whether its last hold may have been direct: if so, the RC settles at its start."""
 
 from __future__ import annotations
 
@@ -9,25 +9,25 @@ from zscout.config.state_folder import write_durably
 
 
 class LastHolder:
-    """Kept in memory only: there was nobody before."""
+    """Kept in memory only, for an RC without an earlier holder."""
 
     def __init__(self, *, may_be_direct: bool = False) -> None:
         self.may_be_direct = may_be_direct
 
     async def note(self, *, direct: bool) -> None:
-        """From now on the RC may have a direct holder, or has none. Raises OSError where that can't be kept."""
+        """Record whether the RC may have a direct holder. Raises OSError if the file can't be written."""
         self.may_be_direct = direct
 
 
 class UnknownLastHolder(LastHolder):
-    """Nothing can be kept: after each start it may have been one."""
+    """Without a state folder: after each start, the last hold may have been direct."""
 
     def __init__(self) -> None:
         super().__init__(may_be_direct=True)
 
 
 class LastHolderFile(LastHolder):
-    """Kept by a file, which is there while the last holder may be a direct one."""
+    """Kept by a file, which exists while the last hold may be direct."""
 
     def __init__(self, folder: Path, rc: str) -> None:
         self._path = folder / "direct" / rc

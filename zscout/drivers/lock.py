@@ -1,8 +1,8 @@
-"""Keeps two processes of one host from offering the same RC: both would hold its device.
+"""Prevents two processes of a host from offering the same RC, which would use its device twice.
 
-Two locks, both gone with their process. A file in the state folder, where other users can't write, keeps processes
-with the same folder apart. A name of Linux's abstract sockets keeps apart those of other folders and of root; but any
-user of the machine may take it first, so only root and this user are believed."""
+There are two locks, both released with their process. A locked file in the state folder, where other users can't write,
+excludes processes with the same folder. A name of Linux's abstract sockets excludes those with other folders, also
+root's; any user can take such a name first, so only root and this user are believed."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ log = logging.getLogger(__name__)
 
 _CREDENTIALS: Final = struct.Struct("3i")
 BACKLOG: Final = 4_096
-"""Processes that may ask a holder for its user: none is ever answered."""
+"""Processes that may connect to a holder to learn its user; no connection is ever accepted."""
 
 
 class LockHolder(NamedTuple):
@@ -39,8 +39,8 @@ class LockHolder(NamedTuple):
 
 @contextmanager
 def only_here(fleet: str, host: str, rc: str, folder: Path | None = None) -> Iterator[None]:
-    """Raises MeshError if another process of this machine, of this user or root, offers `rc` of `fleet` for `host`
-    already. `folder`: the state folder."""
+    """Raises MeshError if another process of this user or root on this machine already offers `rc` of `fleet` for
+    `host`. `folder`: the state folder."""
     with ExitStack() as stack:
         if folder is not None:
             stack.enter_context(_file(folder / "served" / rc, host, rc))
@@ -54,7 +54,7 @@ def only_here(fleet: str, host: str, rc: str, folder: Path | None = None) -> Ite
 
 
 class InUse(Exception):
-    """Another device has a port already; in words that follow the port's name."""
+    """Another device has a port already. The message follows the port's name."""
 
     def __init__(self, holder: LockHolder) -> None:
         here = holder.pid == os.getpid()
@@ -77,7 +77,7 @@ def _file(path: Path, host: str, rc: str) -> Iterator[None]:
         path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         opened = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
     except OSError as error:
-        log.warning("%s can't be opened (%s): no lock in the state folder", path, error.strerror)
+        log.warning("can't open %s (%s): no lock in the state folder", path, error.strerror)
         yield
         return
     try:
@@ -92,7 +92,7 @@ def _file(path: Path, host: str, rc: str) -> Iterator[None]:
 
 @contextmanager
 def _name(name: str, what: str) -> Iterator[None]:
-    """Raises InUse if a process that is believed has this abstract name; `what` is locked by it."""
+    """Take an abstract name as the lock of `what`. Raises InUse if a process of this user or root has it."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as lock:
         try:
             lock.bind(name)
@@ -104,12 +104,12 @@ def _name(name: str, what: str) -> Iterator[None]:
             if holder is not None and not is_stranger(holder.uid):
                 raise InUse(holder) from None
             other = holder or "an unknown process"
-            log.warning("%s: %s has its lock on this machine, and can't be believed; serving it", what, other)
+            log.warning("%s: its lock is held by %s, which is not trusted; serving it anyway", what, other)
         yield
 
 
 def _holder(name: str) -> LockHolder | None:
-    """The process that listens under an abstract name; None if it does not, or does not let itself be asked."""
+    """The process that listens under an abstract name; None if there is none or it does not accept connections."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as asking:
         asking.setblocking(False)
         try:
@@ -122,4 +122,4 @@ def _holder(name: str) -> LockHolder | None:
 
 def _served(host: str, rc: str, holder: LockHolder | None) -> MeshError:
     by = f" ({holder})" if holder is not None else ""
-    return MeshError(f"{rc}: another process on {host} serves it already{by}; end that, or rename this")
+    return MeshError(f"{rc}: another process on {host} serves it already{by}; end that process, or rename this RC")

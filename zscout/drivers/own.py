@@ -1,4 +1,4 @@
-"""What drivers that come with zscout are given beside an `RcHandle`: the mesh, its holds, and who offers other RCs."""
+"""The wider `RcHandle` of drivers that come with zscout: the mesh, the RC's holds, and the hosts of other RCs."""
 
 from __future__ import annotations
 
@@ -17,38 +17,37 @@ from zscout.types import SECOND, Ns
 NODE: Final = "node"
 """The client name of a node."""
 DEPARTED_RC_GRACE: Final[Ns] = 10 * SECOND
-"""A node that ends sends its last command for an RC after the token of that RC has gone."""
+"""Time in which a node may still act for an RC whose token has gone: a node that ends sends its last commands then."""
 
 
 class OwnRcHandle(RcHandle, Protocol):
-    """The RC as zscout's own drivers see it."""
+    """The RC as seen by zscout's own drivers."""
 
     mesh: Mesh
     holds: HoldTable
     instances: Instances
-    """Whether this one serves, or stands by for another host's."""
+    """Decides whether this instance of the RC serves, or is on standby for another host's."""
     directory: RcDirectory | None
-    """Only of a driver that relays."""
+    """None if the driver does not relay."""
 
     informed: asyncio.Event
-    """Set once this RC has read whether another host's serves, or has heard no leader for a while. Its device is left
-    alone until then."""
+    """Set once this RC knows whether another host's instance serves, or has found no leader. Until then the driver must
+    not touch its device."""
 
 
 def own(rc: RcHandle) -> OwnRcHandle:
-    """The same, for a driver that comes with zscout."""
+    """Narrow the type of `rc` for a driver that comes with zscout."""
     return cast("OwnRcHandle", rc)
 
 
 class RcDirectory:
-    """Which host offers which RC, by the liveliness tokens, from `watch` on: its node may act for an RC, and
-    no other."""
+    """The hosts of all RCs by their liveliness tokens, updated after `watch`. Only an RC's node may act for it."""
 
     def __init__(self, mesh: Mesh, on_change: Callable[[], object] = lambda: None) -> None:
         self._mesh = mesh
         self._tokens: dict[str, set[Token]] = {}
         self._recent: dict[tuple[str, str], Ns] = {}
-        """(host, RC): until when its node may still act for it."""
+        """By (host, RC) of a departed token: until when that node may still act for the RC."""
         self._on_change = on_change
 
     def watch(self) -> Declaration:
@@ -68,14 +67,14 @@ class RcDirectory:
         self._on_change()
 
     def hosts(self, rc: str) -> set[str]:
-        """The hosts that offer this RC now: one, unless two nodes are at odds."""
+        """The hosts that offer this RC: a single host, unless two nodes offer the same name."""
         return {token.host for token in self._tokens.get(rc, ())}
 
     def is_node_of_gang(self, sender: Sender, holder: Holder, but: str) -> bool:
-        """Whether `sender` is the node of an RC of this holder's gang, `but` aside."""
+        """Return True if `sender` is the node of an RC in this holder's gang other than `but`."""
         return sender.client == NODE and any(sender.host in self.hosts(rc) for rc in holder.rcs if rc != but)
 
     def is_node_of(self, sender: Sender, rc: str) -> bool:
-        """Whether `sender` is the node that offers this RC, or did so until a moment ago."""
+        """Return True if `sender` is the node that offers this RC, or did within DEPARTED_RC_GRACE."""
         offered = sender.host in self.hosts(rc) or self._recent.get((sender.host, rc), 0) > self._mesh.now()
         return sender.client == NODE and offered

@@ -1,11 +1,11 @@
-"""Packets on a robot's radio: what is sent to a Scout, as bytes and back. Pure.
+"""Packets to a Scout robot on its radio: encoding and decoding. Pure.
 
 A packet is a sync byte, the length of its body, the body (robot, number, operation, arguments) and a CRC-16
 (CCITT, polynomial 0x1021, start 0xFFFF) over length and body:
 
     5A | length | robot | number | operation | arguments ... | crc high | crc low
 
-The radio goes one way, without acknowledgements. So a drive command carries its own end (`lasts`), and other packets
+The radio is one-way, without acknowledgements. So a drive command contains its duration (`lasts`), and other packets
 are sent several times under the same number."""
 
 from __future__ import annotations
@@ -24,17 +24,17 @@ OVERHEAD: Final = 7
 MAX_PACKET: Final = OVERHEAD + 3
 """Bytes of the longest packet, a drive command."""
 TICKS: Final = 50
-"""`lasts` is carried in 1/50 s."""
+"""`lasts` is sent in units of 1/50 s."""
 MAX_LASTS: Final = 255 / TICKS
-"""Seconds that one drive command may last at most."""
+"""Longest duration of a drive command, in seconds."""
 FULL: Final = 127
 """The byte for a wheel's top speed."""
 
 
 @dataclass(frozen=True, slots=True)
 class Packet:
-    """Base of all packets. `robot` is 0 to 254; `number` counts a robot's commands from 0 to 255 and round
-    again: a repeated one is obeyed once."""
+    """Base of all packets. `robot` is 0 to 254. `number` counts a robot's commands modulo 256; the robot obeys packets
+    of the same number once."""
 
     operation: ClassVar[int]
     robot: int
@@ -52,9 +52,9 @@ class Packet:
 
 @dataclass(frozen=True, slots=True)
 class DrivePacket(Packet):
-    """Turns the wheels for `lasts` seconds, unless a newer packet says otherwise.
+    """Turn the wheels for `lasts` seconds, or until a newer packet.
 
-    `left` and `right` are -1 to 1 of top speed; they are carried in steps of 1/127, `lasts` in 1/50 s."""
+    `left` and `right` are -1 to 1 of top speed; they are sent in steps of 1/127, `lasts` in 1/50 s."""
 
     operation: ClassVar[int] = 1
     left: float
@@ -62,7 +62,7 @@ class DrivePacket(Packet):
     lasts: float
 
     def __post_init__(self) -> None:
-        # Not super(): a dataclass with slots is another class than the one that super() would look in.
+        # Not super(): dataclass(slots=True) creates a second class, which the implicit super() does not know.
         Packet.__post_init__(self)
         if not (-1 <= self.left <= 1 and -1 <= self.right <= 1):
             raise ValueError(f"wheels {self.left:g}, {self.right:g} are not within -1 to 1")
@@ -72,14 +72,14 @@ class DrivePacket(Packet):
 
 @dataclass(frozen=True, slots=True)
 class StopPacket(Packet):
-    """Wheels stop; the transmitter stays as it is."""
+    """Stop the wheels; the transmitter is not affected."""
 
     operation: ClassVar[int] = 2
 
 
 @dataclass(frozen=True, slots=True)
 class CameraPacket(Packet):
-    """The camera's transmitter on `channel` (1 to 15); 0 switches it off."""
+    """Set the camera's transmitter to `channel` (1 to 15); 0 switches it off."""
 
     operation: ClassVar[int] = 3
     channel: int
@@ -91,13 +91,13 @@ class CameraPacket(Packet):
 
 @dataclass(frozen=True, slots=True)
 class HaltPacket(Packet):
-    """The safe state: wheels stop and the transmitter is off."""
+    """The safe state: stop the wheels and switch the transmitter off."""
 
     operation: ClassVar[int] = 4
 
 
 def encode(packet: Packet) -> bytes:
-    """The packet as it goes over the air."""
+    """The packet as bytes on the air."""
     arguments = b""
     if isinstance(packet, DrivePacket):
         lasts = max(1, round(packet.lasts * TICKS))
@@ -110,7 +110,7 @@ def encode(packet: Packet) -> bytes:
 
 def _check(what: str, value: int, most: int) -> None:
     if not 0 <= value <= most:
-        raise ValueError(f"{what} {value} is not one of 0 to {most}")
+        raise ValueError(f"{what} {value} is not within 0 to {most}")
 
 
 def _crc(framed: bytes) -> bytes:
@@ -118,7 +118,7 @@ def _crc(framed: bytes) -> bytes:
 
 
 class PacketDecoder:
-    """Finds packets in a stream of bytes that may begin anywhere, miss parts and hold noise."""
+    """Finds packets in a stream of bytes, which may begin anywhere, have gaps and contain noise."""
 
     def __init__(self) -> None:
         self._rest = bytearray()
@@ -126,7 +126,7 @@ class PacketDecoder:
         """Sync bytes that began no valid packet."""
 
     def feed(self, data: bytes) -> list[Packet]:
-        """The packets that `data` completes, in order. Less than a packet is kept for the next call."""
+        """The packets completed by `data`, in order. An incomplete packet is kept for the next call."""
         self._rest += data
         found: list[Packet] = []
         at = 0
@@ -142,7 +142,7 @@ class PacketDecoder:
                     found.append(packet)
                     at = end
                     continue
-            # No packet begins here; one may begin within what was taken for it.
+            # No packet begins here, but a packet may begin within the bytes after this sync byte.
             self.spoiled += 1
             at += 1
         del self._rest[: at if at >= 0 else len(self._rest)]
@@ -150,7 +150,7 @@ class PacketDecoder:
 
 
 def _decode(framed: bytes) -> Packet | None:
-    """The packet between sync byte and end; None: no valid one."""
+    """Decode the bytes after the sync byte; None if they are not a valid packet."""
     if _crc(framed[:-2]) != framed[-2:]:
         return None
     robot, number, operation, *arguments = framed[1:-2]

@@ -1,6 +1,6 @@
-"""Which driver an RC of a node file has: one that comes with zscout, or one that is installed beside it.
+"""Finds the driver of an RC in a node file: a driver of zscout, or an installed plugin.
 
-Such a one is an entry point of the group `zscout.drivers`; docs/how-to/write-a-driver.md tells how to write it."""
+A plugin is an entry point of the group `zscout.drivers`; docs/how-to/write-a-driver.md explains how to write it."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ BUILT_IN: Final[Mapping[str, str]] = MappingProxyType(
         "video": "zscout.drivers.generic:VideoDriver",
     }
 )
-"""Name: module and class. What a device needs is loaded where there is one: pyserial, OpenCV."""
+"""Module and class by name. They are imported on demand, with pyserial or OpenCV."""
 
 
 def driver_for(rc: RcConfig) -> Driver:
-    """The driver of an RC, with its options. Raises BadInput: one line that says what to install or to mend."""
+    """The driver of an RC, with its options. Raises BadInput, with the package to install or the key to correct."""
     if isinstance(rc, PluginRc):
         return _make(rc, _plugin(rc))
     name = driver_name(rc)
@@ -50,12 +50,12 @@ def driver_for(rc: RcConfig) -> Driver:
 
 
 def driver_name(rc: RcConfig) -> str:
-    """As it stands in the node file."""
+    """The driver's name in the node file."""
     return rc.driver if isinstance(rc, PluginRc) else str(rc.__struct_config__.tag)
 
 
 def installed() -> dict[str, list[metadata.EntryPoint]]:
-    """The drivers that are installed beside zscout, by name; more than one where packages are at odds."""
+    """Installed plugins by name; several entries if packages conflict."""
     found: dict[str, list[metadata.EntryPoint]] = {}
     for entry in sorted(metadata.entry_points(group=GROUP)):
         places = found.setdefault(entry.name, [])
@@ -74,7 +74,7 @@ def _plugin(rc: PluginRc) -> type[Driver]:
         there = ", ".join(map(quoted, names))
         raise at.bad(
             f"no driver {quoted(rc.driver)} is installed here",
-            f"{meant} the package that brings it into this environment, or write one of {there}",
+            f"{meant} its package into this environment, or write one of {there}",
         )
     if len(places) > 1:
         packages = " and ".join(map(_origin, places))

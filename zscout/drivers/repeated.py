@@ -1,4 +1,4 @@
-"""Commands that arrive again, over a second relay or because their sender had no answer: they are carried out once."""
+"""Carries out repeated commands once: they arrive again over a second relay, or if their sender got no answer."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from zscout.mesh import Answered, IncomingQuery, Refused
 from zscout.messages import Command
 
 MAX_HOSTS: Final = 64
-"""Hosts whose commands are remembered: those that commanded last."""
+"""Hosts whose commands are remembered, the most recent ones."""
 MAX_PER_HOST: Final = 256
-"""Commands of one host that are remembered: the latest."""
+"""Remembered commands of a host, the most recent ones."""
 MAX_WAITING: Final = 8
-"""Arrivals of one command that may wait for its answer."""
+"""Repetitions of a command that wait for its answer."""
 
 
 class CommandMemory:
@@ -24,7 +24,8 @@ class CommandMemory:
         self._hosts: OrderedDict[str, OrderedDict[tuple[str, str], Answered]] = OrderedDict()
 
     def is_new(self, sender: Sender, query: IncomingQuery[Command]) -> bool:
-        """False: it came before, and is answered as then. What has no id is always new. Raises Refused."""
+        """Return False if the command was received before; it then gets the same answer. A command without an id is
+        always new. Raises Refused."""
         if query.message.id is None:
             return True
         known, name = self._of(sender.host), (sender.client, query.message.id)

@@ -290,7 +290,7 @@ class ResourceController:
         return max(self.driver.begin_within, self._longest_begin) if own is None else own
 
     def publish(self, ended: list[messages.EndedHold] | None = None) -> None:
-        self._published, self._use.news = self.mesh.now(), False
+        self._published, self._use.unpublished = self.mesh.now(), False
         self._state.put(self._rc_state(ended or []))
 
     # What the RCM sends
@@ -376,7 +376,7 @@ class ResourceController:
             begin_within=self.begin_within,
             parameters=None if leaving else self.driver.parameters(),
             version=VERSION,
-            used=self._use.told(self.mesh.now()),
+            used=self._use.report(self.mesh.now()),
         )
 
     @property
@@ -780,7 +780,7 @@ class ResourceController:
             await asyncio.sleep(FIGURES_PERIOD)
             silent = self.mesh.now() - self._published > SAY_AGAIN * SECOND
             # How much a hold that stands was used grows all the time: that is said with what is said anyway.
-            if self._figures() != published or self._use.news or silent:
+            if self._figures() != published or self._use.unpublished or silent:
                 self.publish()
 
     async def _keep_looking(self) -> None:

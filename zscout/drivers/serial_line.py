@@ -1,4 +1,4 @@
-"""A serial line in a thread of its own: pyserial blocks. It opens again what was unplugged, for ever."""
+"""A serial line served by its own thread, since pyserial blocks. It reopens an unplugged port, without limit."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from zscout.types import SECOND, Ns
 
 DEPTH: Final = 2
 PAUSES: Final = (0.2, 2.0)
-"""Seconds before it is opened again: the first, and the longest."""
+"""Seconds before it is reopened: the first pause, and the longest."""
 CLOSE_TIMEOUT: Final = 3.0
 LOOK: Final = 0.02
 
@@ -24,16 +24,16 @@ LOOK: Final = 0.02
 class SerialLine:
     """A line to `port`, until `stop`.
 
-    Called in the event loop: `up()` when the line is open; `down(why)` when it can't be used, once for each reason in a
-    row; `wrote()` when the system has taken a packet, or it was too old to be sent. At most DEPTH packets are handed to
-    the thread at a time; the caller hands over no more than the line carries (`transmit_queue`)."""
+    Callbacks in the event loop: `up()` when the line is open; `down(why)` when it is not usable, once for each change
+    of the reason; `wrote()` when the system has accepted a packet, or it was too old to send. The thread takes at most
+    DEPTH packets at a time; the caller keeps to the rate of the line (`transmit_queue`)."""
 
     def __init__(
         self, port: SerialPort, *, up: Callable[[], None], down: Callable[[str], None], wrote: Callable[[], None]
     ) -> None:
         self.port = port
         self.received = 0
-        """Bytes that came in: the radio goes one way, so they are counted and forgotten."""
+        """Received bytes: they are only counted, since the radio is one-way."""
         self._up, self._down, self._wrote = up, down, wrote
         self._loop = asyncio.get_running_loop()
         self._queue: queue.Queue[tuple[bytes, Ns | None]] = queue.Queue(DEPTH)
@@ -43,13 +43,13 @@ class SerialLine:
         self._thread.start()
 
     async def stop(self) -> None:
-        """Closes the line; what was handed over goes out first, if it goes."""
+        """Close the line, after sending the packets handed over if possible."""
         self._stopping.set()
         await asyncio.to_thread(self._thread.join, CLOSE_TIMEOUT)
 
     def write(self, data: bytes, until: Ns | None = None) -> bool:
-        """Hands a packet to the thread, and `wrote` will be called for it; False: DEPTH wait there. It is not sent
-        after `until`, by the host's clock."""
+        """Hand a packet to the thread, which then calls `wrote`. Return False if DEPTH packets wait there. After
+        `until`, by the host's clock, the packet is not sent."""
         with contextlib.suppress(queue.Full):
             self._queue.put_nowait((data, until))
             return True
@@ -62,7 +62,7 @@ class SerialLine:
         while not self._stopping.is_set():
             try:
                 self.port.open()
-            except Exception as error:  # noqa: BLE001 - what a URL handler raises is nobody's promise
+            except Exception as error:  # noqa: BLE001 - URL handlers may raise any exception
                 self._fail(error)
             else:
                 pause = PAUSES[0]
@@ -71,8 +71,8 @@ class SerialLine:
             pause = min(2 * pause, PAUSES[1])
 
     def _serve(self) -> None:
-        """Writes until the line fails or nobody wants it any more."""
-        while not self._queue.empty():  # handed over while it was down: too old
+        """Write until the line fails or is stopped."""
+        while not self._queue.empty():  # handed over while the line was down: too old
             self._queue.get_nowait()
         self._why = ""
         self._call(self._up)
@@ -91,7 +91,7 @@ class SerialLine:
             while self.port.outstanding() and clock.now() < end:
                 time.sleep(LOOK)
             self.port.close(discard=self.port.outstanding() > 0)
-        except Exception as error:  # noqa: BLE001 - OSError, termios.error and what else pyserial lets through
+        except Exception as error:  # noqa: BLE001 - OSError, termios.error and others that pyserial lets through
             self._fail(error)
             self.port.close(discard=True)
 
@@ -104,5 +104,5 @@ class SerialLine:
     def _call(self, call: Callable[..., None], *args: Any) -> None:
         try:
             self._loop.call_soon_threadsafe(call, *args)
-        except RuntimeError:  # the loop is closed: the process is on its way out
+        except RuntimeError:  # the loop is closed: the process is ending
             self._stopping.set()

@@ -1,5 +1,5 @@
-"""Why the pictures of a URL can't be had, in words: OpenCV says only that they can't. Blocking; nothing of a URL that
-may be secret is in the words."""
+"""Finds out why a video URL can't be opened, since OpenCV gives no reason. Blocking. Reasons contain no part of the URL
+that may be secret."""
 
 from __future__ import annotations
 
@@ -22,39 +22,40 @@ DECODABLE: Final = re.compile(
     r"multipart/|image/|video/|application/(octet-stream|vnd\.apple\.mpegurl|x-mpegurl)", re.IGNORECASE
 )
 UNDECODABLE: Final[Mapping[str, str]] = {"av01": "AV1", "av1": "AV1", "vvc1": "H.266", "h266": "H.266", "evc1": "EVC"}
-"""Codecs that the wheel of OpenCV knows by name alone."""
+"""Codecs that OpenCV's wheel names but can't decode."""
 REMEDY: Final = "set the camera to H.264, H.265 or MJPEG"
 MALFORMED: Final = "the address is malformed"
 MAX_REPLY: Final = 65_536
 
 _STATUS: Final = {
-    400: "it finds the address malformed",
-    403: "it forbids this to everybody, or to this user",
+    400: "it rejects the address as malformed",
+    403: "access is forbidden, perhaps only for this user",
     404: "it has no such page; is the path right?",
     405: "it has no pictures at this path",
-    407: "a proxy wants a user and password",
+    407: "a proxy requires a user and password",
     408: "it waited too long for a request",
-    410: "it has no such page any more",
-    429: "it was asked too often",
-    453: "it has no bandwidth left for one more viewer",
-    454: "it knows no such session",
-    461: 'it does not do this transport; set transport = "udp", or "tcp"',
-    500: "it failed inside",
+    410: "the page no longer exists",
+    429: "too many requests",
+    453: "it has no bandwidth left for another viewer",
+    454: "unknown session",
+    461: 'it does not support this transport; set transport = "udp", or "tcp"',
+    500: "internal error of the server",
     502: "its gateway failed",
-    503: "it is busy, or serves others and has no place left",
+    503: "it is busy, or has no capacity left for another viewer",
     504: "its gateway got no answer",
 }
 _OS: Final = {
     errno.ECONNREFUSED: "nothing listens there; does its server run, and is the port right?",
-    errno.EHOSTUNREACH: "there is no way to its host; is it on, and on this network?",
-    errno.ENETUNREACH: "there is no way to its network",
+    errno.EHOSTUNREACH: "its host is unreachable; is it on, and on this network?",
+    errno.ENETUNREACH: "its network is unreachable",
     errno.ECONNRESET: "it hung up without an answer",
     errno.EPIPE: "it hung up without an answer",
 }
 
 
 def why_closed(url: str, timeout: float) -> str | None:
-    """What a request of our own finds, at most `timeout` seconds a step; None: nothing is wrong that it could see."""
+    """Send a request to the URL, with at most `timeout` seconds for each step. Return the fault as text; None if no
+    fault is found."""
     try:
         parts = urlsplit(url)
         port = parts.port
@@ -85,7 +86,7 @@ def _http(parts: SplitResult, timeout: float) -> str | None:
         passwords = urllib.request.HTTPPasswordMgrWithDefaultRealm()
         passwords.add_password(None, bare, unquote(parts.username), unquote(parts.password or ""))
         signs_in = [urllib.request.HTTPBasicAuthHandler(passwords), urllib.request.HTTPDigestAuthHandler(passwords)]
-    # As FFmpeg: no certificate is checked.
+    # FFmpeg does not check certificates, so neither does this request.
     opener = urllib.request.build_opener(
         urllib.request.ProxyHandler({}),
         urllib.request.HTTPSHandler(context=ssl._create_unverified_context()),  # noqa: S323
@@ -94,15 +95,15 @@ def _http(parts: SplitResult, timeout: float) -> str | None:
     request = urllib.request.Request(bare, headers={"User-Agent": AGENT})  # noqa: S310 - http or https
     try:
         opened = opener.open(request, timeout=timeout)
-    except ValueError:  # of its handlers: a way to sign in that they do not know
+    except ValueError:  # raised by the handlers for an unknown authentication scheme
         return _of_status(401, parts)
     with opened as reply:
         sent = reply.headers.get("Content-Type", "")
         if reply.status == 204:
-            return "it answers without a content"
+            return "its answer is empty"
     kind = sent.partition(";")[0].strip()[:60]
     if kind.lower() in ("text/html", "application/xhtml+xml"):
-        return "it sends a page of HTML, not pictures; is that its page to log in?"
+        return "it sends an HTML page, not pictures; is it a login page?"
     if kind and not DECODABLE.match(kind):
         return f"it sends {kind}, not pictures"
     return None
@@ -140,7 +141,7 @@ def _reply(host: str, port: int, ask: str, timeout: float) -> bytes:
 
 
 def _signed(reply: bytes, url: str, parts: SplitResult) -> str:
-    """The header by which a user signs in, as the server wants it; empty where it wants what is not known here."""
+    """The Authorization header for the server's challenge; "" for an unknown scheme."""
     user, password = unquote(parts.username or ""), unquote(parts.password or "")
     wanted = re.findall(rb"^WWW-Authenticate: *(\w+) +(.*?)\r?$", reply, re.IGNORECASE | re.MULTILINE)
     for way, challenge in wanted:
@@ -164,9 +165,9 @@ def _whole(reply: bytes) -> bool:
 
 def _of_status(status: int, parts: SplitResult) -> str:
     if status == 401:
-        words = "it refuses this user and password" if parts.username is not None else "it wants a user and password"
+        words = "it refuses this user and password" if parts.username is not None else "it requires a user and password"
     elif 300 <= status < 400:
-        words = "it redirects without an end, or to nowhere"
+        words = "it redirects endlessly, or without a target"
     else:
         words = _STATUS.get(status, "it failed" if status >= 500 else "it refuses this")
     return f"{words} ({status})"
@@ -175,11 +176,11 @@ def _of_status(status: int, parts: SplitResult) -> str:
 def _of_error(error: Exception, timeout: float) -> str:
     if isinstance(error, socket.gaierror):
         again = error.errno == socket.EAI_AGAIN
-        return "there is no such host" + (", or names can't be looked up just now" if again else "")
+        return "unknown host" + (", or name lookup does not work at present" if again else "")
     if isinstance(error, TimeoutError):
         return f"it did not answer within {timeout:g} s"
     if isinstance(error, ssl.SSLError):
-        return "it does not speak TLS, or not as it is spoken here; is it http:// rather than https://?"
+        return "it does not speak TLS, or no supported version; is it http:// rather than https://?"
     if isinstance(error, http.client.RemoteDisconnected):
         return "it hung up without an answer"
     if isinstance(error, http.client.HTTPException):

@@ -1,7 +1,7 @@
-"""How long an RC that is not well keeps its holders, and is offered while free. Pure; time is passed in.
+"""The time for which an unwell RC keeps its holders, or remains available while free. Pure; time is passed in.
 
-A device that stops answering may be rebooted by its holder's own test. Until the deadline its RC is *unwell*; from then
-on it is lost. The time counts from when it became unwell, at the earliest from the beginning or the end of the hold."""
+A device that stops answering may be rebooting in its holder's own test. Until the deadline its RC is *unwell*,
+afterwards lost. The time counts from the failure, or from the later begin or end of the hold."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ MAX_OUTAGE: Final = 86_400.0
 
 
 class _Expected(NamedTuple):
-    """What a holder has announced: one outage that is over at a time, and how long each may last."""
+    """A holder's announced outages: a single outage that ends by `until`, and the longest duration of `each`."""
 
     until: Ns = 0
     each: Ns = 0
@@ -25,14 +25,14 @@ class _Expected(NamedTuple):
 
 class Tolerance:
     def __init__(self, held: Ns, free: Ns, most: Ns) -> None:
-        """`most`: the longest outage that a holder can announce."""
+        """Times tolerated while held and while free, and the longest outage that a holder can announce."""
         self._held, self._free, self._most = held, free, most
         self.why = ""
         """Empty while it is well."""
         self.since: Ns = 0
-        """When it became unwell."""
+        """Time at which it became unwell."""
         self._from: Ns = 0
-        """When it was first held, or free, as it is now."""
+        """Time at which it was last granted or became free."""
         self._holds: dict[Grant, _Expected] = {}
 
     def unwell(self, why: str, now: Ns) -> None:
@@ -43,16 +43,16 @@ class Tolerance:
     def well(self) -> None:
         self.why = ""
 
-    def changed(self, held: Collection[Grant], going_on: Mapping[Grant, Grant], now: Ns) -> None:
-        """These grants are in force. `going_on`: by grant the one that it continues."""
+    def changed(self, held: Collection[Grant], continued: Mapping[Grant, Grant], now: Ns) -> None:
+        """Update the grants in force. `continued`: by grant, the earlier grant that it continues."""
         before = self._holds
-        self._holds = {grant: before.get(going_on.get(grant, grant), _Expected()) for grant in held}
-        if not any(going_on.get(grant, grant) in before for grant in held) and (before or held):
+        self._holds = {grant: before.get(continued.get(grant, grant), _Expected()) for grant in held}
+        if not any(continued.get(grant, grant) in before for grant in held) and (before or held):
             self._from = now
 
     def expect(self, grant: Grant, do: Mapping[str, Any], now: Ns) -> float:
-        """A holder announces an outage of `seconds`, or with `each` outages that each last as long at most. Return the
-        seconds that are tolerated. Raises Refused."""
+        """A holder announces an outage of `seconds`, or with `each` any number of outages of at most `seconds` each.
+        Return the tolerated seconds. Raises Refused."""
         seconds, each = do.get("seconds"), do.get("each", False)
         if isinstance(seconds, bool) or not isinstance(seconds, int | float) or not isinstance(each, bool):
             raise Refused("bad_command", "expect_outage needs seconds, as in seconds = 60; `each` is true or false")
@@ -64,7 +64,7 @@ class Tolerance:
 
     @property
     def lost_at(self) -> Ns | None:
-        """When it is lost unless it is well before; None while it is well."""
+        """Time at which it is lost unless it recovers; None while it is well."""
         if not self.why:
             return None
         begun = max(self.since, self._from)

@@ -1,4 +1,4 @@
-"""What waits for the worker of one RC: changes of its holds, and commands."""
+"""The queue of an RC's worker: changes of its holds, and commands."""
 
 from __future__ import annotations
 
@@ -10,33 +10,33 @@ from zscout.drivers.confirm_server import CommandQuery
 from zscout.drivers.holds import HoldChange
 
 COMMANDS_PER_HOST = 48
-"""Of those that wait, at most."""
+"""Waiting commands of a host."""
 EARLY_PER_HOST = 16
-"""Commands of one host that may be set aside."""
+"""Commands of a host that are set aside."""
 
 
 class WorkQueue:
-    """What an RC has to carry out: changes of holders first, so that a safe state waits for no command.
+    """Changes of holders come first, so that a safe state never waits for a command.
 
-    A command under a grant that the RC does not know yet is set aside, outside the queue, until the RC knows more; then
-    it goes before all other commands, so that none of the same grant overtakes it."""
+    A command under a grant that the RC does not know yet is set aside until the RC knows more, and then precedes all
+    other commands, so that no later command of the same grant overtakes it."""
 
     def __init__(self) -> None:
         self._changes: deque[HoldChange] = deque()
         self._commands: deque[tuple[str, CommandQuery]] = deque()
         """With the sender's host."""
         self._early: list[tuple[str, CommandQuery]] = []
-        """Likewise, in the order of arrival."""
+        """Commands set aside, with the sender's host, in the order of arrival."""
         self._wakeup = asyncio.Event()
 
     @property
     def commands(self) -> int:
-        """Commands that wait, those that are set aside included."""
+        """Number of waiting commands, also those set aside."""
         return len(self._commands) + len(self._early)
 
     @property
     def early(self) -> int:
-        """Those that are set aside."""
+        """Number of commands set aside."""
         return len(self._early)
 
     def put_change(self, change: HoldChange) -> None:
@@ -44,7 +44,7 @@ class WorkQueue:
         self._wakeup.set()
 
     def put_command(self, command: CommandQuery, host: str) -> bool:
-        """False: too many of this host wait already."""
+        """Return False if too many commands of this host wait already."""
         if self.commands >= COMMANDS_PER_HOST:
             waiting = Counter(of for queue in (self._commands, self._early) for of, _ in queue)
             if waiting[host] >= COMMANDS_PER_HOST:
@@ -54,14 +54,14 @@ class WorkQueue:
         return True
 
     def set_aside(self, command: CommandQuery, host: str) -> bool:
-        """Keeps a command for `resume`. False: too many of this host are kept already."""
+        """Keep a command for `resume`. Return False if too many of this host are kept already."""
         if Counter(of for of, _ in self._early)[host] >= EARLY_PER_HOST:
             return False
         self._early.append((host, command))
         return True
 
     def resume(self, ready: Callable[[CommandQuery], bool]) -> None:
-        """Puts early commands that are `ready` before all others, in the order of arrival."""
+        """Move the `ready` commands among those set aside to the front of the queue, in the order of arrival."""
         found = [early for early in self._early if ready(early[1])]
         self._early = [early for early in self._early if early not in found]
         self._commands.extendleft(reversed(found))
@@ -69,12 +69,12 @@ class WorkQueue:
             self._wakeup.set()
 
     def drop_early(self) -> list[CommandQuery]:
-        """Commands that are set aside still, which are no longer kept."""
+        """Remove and return the commands that are still set aside."""
         dropped, self._early = self._early, []
         return [command for _, command in dropped]
 
     async def get(self) -> HoldChange | CommandQuery:
-        """The next change or command, once there is one."""
+        """Wait for the next change or command."""
         while not (self._changes or self._commands):
             self._wakeup.clear()
             await self._wakeup.wait()
