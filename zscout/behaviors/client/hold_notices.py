@@ -37,7 +37,7 @@ class HoldNotice(NamedTuple):
         return cls(end.code, end.by, end.rcs, now + round(end.safe * SECOND), begins)
 
     def is_like(self, other: HoldNotice, now: Ns) -> bool:
-        """Return True if this tells a holder nothing that `other` has not told."""
+        """Return True if `other` has the same content, but for small changes of its times."""
         times = zip((self.safe_until, self.begins or 0), (other.safe_until, other.begins or 0), strict=True)
         close = all(abs(max(one, now) - max(known, now)) < SAME for one, known in times)
         return close and (self.by.client, self.by.id, self.rcs) == (other.by.client, other.by.id, other.rcs)
@@ -64,7 +64,7 @@ class HoldNotice(NamedTuple):
 
 
 class NoticeTracker:
-    """What the holder of one hold has been told."""
+    """The notices that the holder of one hold has received."""
 
     def __init__(self) -> None:
         self._known: dict[str, HoldNotice] = {}
