@@ -43,7 +43,8 @@ until = bench.until
 
 
 def recorder(folder: str = "runs") -> str:
-    return f'[recorder]\npath = "{folder}"\nport = {free_port()}'
+    """Without the past of journals, which a recorder on a busy machine may still learn."""
+    return f'[recorder]\npath = "{folder}"\nport = {free_port()}\npast = 0'
 
 
 async def recording(lab: Lab) -> None:
