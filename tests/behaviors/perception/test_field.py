@@ -251,3 +251,21 @@ def test_people_who_run_about_are_no_rain() -> None:
             picture[top : top + 18, left : left + 7] = 20
         moving.append(detector.see(4 + number / 2, picture).moving)
     assert sum(moving) >= 8
+
+
+def test_a_road_that_is_seldom_empty_is_no_noise() -> None:
+    """Cars of any shade cover a lane for half of the time."""
+    rng, scene, detector = np.random.default_rng(36), Scene(36, noise=2.0), MotionDetector(outlines=True)
+    comes, found, there = 0.0, 0, 0
+    cars = [(comes := comes + 1.2 * rng.uniform(0.2, 2), rng.uniform(20, 230)) for _ in range(30)]
+    for time in (number / RATE for number in range(350)):
+        picture, truth = scene.picture(), np.zeros((HEIGHT, WIDTH), np.bool_)
+        for since, shade in cars:
+            if since <= time < since + 0.6:
+                top = int(HEIGHT * (time - since) / 0.6) - 20
+                car = np.s_[max(0, top) : top + 20, 70:95]
+                truth[car], picture[car] = True, shade
+        mask = detector.see(time, picture).mask
+        if time > 15 and mask is not None:
+            found, there = found + int(np.count_nonzero(truth & (mask > 0))), there + int(np.count_nonzero(truth))
+    assert found > 0.75 * there

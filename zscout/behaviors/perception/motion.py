@@ -230,7 +230,11 @@ class MotionDetector:
         if middle > ALL_OFF or (share > UPHEAVAL and not stirs):
             return self._begin(time, grey), None
         drops = self._rain.drops
-        self._learn(away, mask if drops is None else mask | drops, passed / LEARN, 0.0 if stirs else passed / ABSORB)
+        # A pixel that is clearly off is learned slowly, region or not: a busy road is no noise.
+        moved = mask | (score > STRONG).astype(np.uint8)
+        if drops is not None:
+            moved |= drops
+        self._learn(away, moved, passed / LEARN, 0.0 if stirs else passed / ABSORB)
         largest = sorted(regions.tolist(), key=lambda region: -region[cv2.CC_STAT_AREA])[:MAX_BOXES]
         height, width = picture.shape[:2]
         boxes = tuple(
