@@ -138,7 +138,7 @@ def descendants(root: int) -> list[Descendant]:
 
 
 def caught_by(pid: int) -> int:
-    """The signals that a process catches: bit 0 is signal 1. None where /proc does not show it."""
+    """The signals that a process catches: bit 0 is signal 1. 0 where /proc does not show them."""
     with suppress(OSError, ValueError), open(f"/proc/{pid}/status") as file:  # noqa: PTH123
         return next((int(line[7:], 16) for line in file if line.startswith("SigCgt:")), 0)
     return 0
@@ -213,7 +213,7 @@ class Guardian:
         self._leader = self._command = 0
         """The command, until it was waited for; from then on its number may be another's. And its group."""
         self._signals: set[int] = set()
-        """Those that COMMAND is to get once it catches them."""
+        """Signals for COMMAND, which it gets once it catches them."""
         self._pause, self._round = ROUND, 0
         """Between two rounds of SIGKILL, and when the next one is."""
         self._stuck: set[int] = set()

@@ -190,10 +190,10 @@ class Held:
             over.cancel()
 
     def __repr__(self) -> str:
-        return f"<{type(self).__name__} {self.words}>"
+        return f"<{type(self).__name__} {self._words}>"
 
     @property
-    def words(self) -> str:
+    def _words(self) -> str:
         """The request, the devices, and how long they are held or why no longer."""
         if self.active and not self.completed:
             stands = f"{self.remaining:.0f} s left" if self.remaining > 0 else kept(self.arc.priority)

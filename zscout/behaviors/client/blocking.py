@@ -88,8 +88,8 @@ class BlockingHeld:
         return self._held.upcoming
 
     def on_notice(self, callback: Callable[[HoldNotice], object]) -> None:
-        """Call `callback` in a thread of zscout's with each notice of what the hold yields to, and when that no longer
-        comes; at once with those that are known. What takes long there delays other holds of this lab."""
+        """Call `callback` in a thread of zscout's with each notice of what the hold yields to: at once with those that
+        are known. A slow callback delays other holds of this lab."""
         self._lab.run(self._call_when_noticed(callback))
 
     async def noticed(self) -> HoldNotice | None:
@@ -175,7 +175,7 @@ class BlockingHeld:
                 self._lab.run(_close(frames))
 
     def __repr__(self) -> str:
-        return f"<{type(self).__name__} {self._held.words}>"
+        return f"<{type(self).__name__} {self._held._words}>"
 
     async def _call_when_over(self, callback: Callable[[], object]) -> None:
         over = asyncio.create_task(self._held.over())

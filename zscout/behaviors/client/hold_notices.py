@@ -11,7 +11,7 @@ from zscout.scheduling.reason import named
 from zscout.types import SECOND, Ns, clean
 
 WITHDRAWN_AFTER: Final[Ns] = 3 * SECOND // 2
-"""A new leader may hear of the waiting requests a little after it has answered the holder."""
+"""A new leader may learn of the waiting requests a little after it has answered the holder."""
 SAME: Final[Ns] = 2 * SECOND
 """A smaller change of a time is not reported."""
 
@@ -38,8 +38,8 @@ class HoldNotice(NamedTuple):
 
     def is_like(self, other: HoldNotice, now: Ns) -> bool:
         """Return True if `other` has the same content, but for small changes of its times."""
-        times = zip((self.safe_until, self.begins or 0), (other.safe_until, other.begins or 0), strict=True)
-        close = all(abs(max(one, now) - max(known, now)) < SAME for one, known in times)
+        times = ((self.safe_until, other.safe_until), (self.begins or 0, other.begins or 0))
+        close = all(abs(max(mine, now) - max(theirs, now)) < SAME for mine, theirs in times)
         return close and (self.by.client, self.by.id, self.rcs) == (other.by.client, other.by.id, other.rcs)
 
     def text(self, now: Ns, clock: Callable[[float], str] | None = None, by: str = "") -> str:

@@ -268,7 +268,7 @@ class HoldOptions:
     """The id of the booking that it takes up."""
     infra_exit: int | None = None
     notify_signal: int | None = None
-    """What the command gets when the hold is to yield to somebody."""
+    """The signal for the command when its hold is to yield."""
     events: EventFile | None = None
     direct: bool = False
     """Whether programs touch the devices past zscout; those of a command do."""

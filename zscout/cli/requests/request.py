@@ -281,7 +281,7 @@ def reporting_unwell(report: Report, held: Held, client: Client) -> Iterator[Non
         yield
 
 
-async def _tell_dates(report: Report, held: Held, client: Client) -> None:
+async def _report_dates(report: Report, held: Held, client: Client) -> None:
     dates = next_dates(await look(client), held.rcs, f"{client.mesh.me}/{held.arc.id}")
     if dates:
         lines = "\n  ".join(map(str, dates[:MAX_DATES_SHOWN]))
@@ -293,7 +293,7 @@ async def report_notices(
 ) -> None:
     """Report the next booking of each device, and what the hold yields to, until it is over; `noticed` is called with
     each notice and its words."""
-    async with common.beside(_tell_dates(report, held, client)):
+    async with common.beside(_report_dates(report, held, client)):
         await _report_each(report, held, User.of(client), noticed)
 
 

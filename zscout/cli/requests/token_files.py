@@ -70,7 +70,7 @@ class FromHolder(msgspec.Struct, frozen=True, omit_defaults=True):
     why: str = ""
     code: int = 0
     withdrawn: bool = False
-    """`notice`: that no longer comes."""
+    """`notice`: True if its cause is gone."""
     remaining: float = 0
     """`done`, of `renew`: seconds for which the hold is protected."""
 
