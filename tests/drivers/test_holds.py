@@ -121,7 +121,7 @@ def test_what_is_old_counts_after_a_silence_but_not_where_this_process_stood_sti
     """A late publication, read first after a stall, is no sign that a newer one was forged."""
     late = said(1, touches=False)
     rc, stalled = holding(HELD), holding(HELD)
-    assert not stalled.apply_grants(late, NOW + LEASE, stood_still=True)
+    assert not stalled.apply_grants(late, NOW + LEASE, stalled=True)
     assert stalled.seq == holding(HELD).seq
     assert rc.apply_grants(late, NOW + LEASE).reread
     assert rc.seq == late.seq

@@ -1,21 +1,21 @@
-"""Who holds an RC, as the RC itself knows it: *the resource is its own arbiter*. Pure; time is passed in.
+"""The holders of an RC, as the RC itself knows them: *the resource is its own arbiter*. Pure; time is passed in.
 
 The rules, all of them:
 
-- What an RCM publishes is ordered by (term, seq). Older than the newest received or promised: ignored. So
-  is a term absurdly far above it: it would silence every RCM to come.
-- A publication that touches this RC lists all its holders from then on. If it names another instance of the RC, this
-  one holds nothing.
-- A gap, or a new term, means that something was missed: the RC reads `rcm/state` and presents its hold. A
-  snapshot may add a hold that was missed; it ends nothing.
-- A command is obeyed only under exactly a grant that is held now, from the client that holds it.
-- A hold ends here by itself when its time is over, or when nothing of an RCM was received for the hold lease.
-- Its time begins when the device has begun for it, and where other devices of it have not (`waits` in a publication),
-  when the leader publishes that they have.
-- A promise given to a term is kept: no lower one is obeyed again.
-- The program of a direct hold touches the device past this RC. When such a hold, once confirmed here, ends in any way
-  but its own client's release or a hand-over, the RC settles: nothing is obeyed under grants that began after that end,
-  until the old client says that its program has left, or it must have been killed.
+- Publications of an RCM are ordered by (term, seq). The RC ignores one that is older than the newest received or
+  promised. It also ignores an absurdly high term, which would silence every later RCM.
+- A publication about this RC lists all its new holders. If it names another instance of the RC, this instance holds
+  nothing.
+- A gap or a new term means that the RC missed something: it reads `rcm/state` and presents its holds. The snapshot can
+  add a missed hold, but ends none.
+- A command is obeyed only under a grant that is in force now, and only from the client that holds it.
+- The RC ends a hold by itself when its time is over, or when no RCM published for the hold lease.
+- The time of a hold begins when the device has begun for it. While other devices of the hold have not begun (`waits` in
+  a publication), it begins when the leader publishes that they have.
+- A promise to a term is kept: no lower term is obeyed again.
+- The program of a direct hold uses the device past this RC. If such a hold was confirmed here and ends other than by
+  its client's release or a hand-over, the RC settles: it obeys no command under grants that began after this end, until
+  the old client reports that its program has left, or the program must have been killed.
 """
 
 from __future__ import annotations
@@ -33,9 +33,9 @@ from zscout.scheduling.reason import ended, named
 from zscout.types import NO_TERM, SECOND, Grant, HostName, Ns, Place, Term
 
 BEFORE: Final = Grant(NO_TERM, 0)
-"""Stands for the hold of whoever had this RC before it started."""
+"""Represents the unknown hold before this RC started."""
 REMEMBERED = 64
-"""Grants that ended lately, kept to say why a command under one of them is refused."""
+"""Ended grants that are kept, to explain why a command under such a grant is refused."""
 MAX_HOLDERS = 1_024
 
 
@@ -44,36 +44,36 @@ class HoldEntry:
     """A holder, and when its minimum runtime is over on this host's clock."""
 
     holder: Holder
-    """As published last."""
+    """As last published."""
     end: Ns
     since: int = 0
-    """Counts beginnings and ends: a hold is held back by what settles since before it."""
+    """Number of the event by which it began. Settling that began before it holds it back."""
     gone_by: Ns | None = None
-    """Of a direct one that was confirmed: by then its program is gone, if it is not confirmed again."""
+    """For a confirmed direct hold: when its program is gone, unless it is confirmed again."""
     begun: bool = True
-    """The device has begun for it."""
+    """True if the device has begun for it."""
     protected_from: Ns | None = None
     """From then on only operators preempt it."""
 
     @property
     def is_timed(self) -> bool:
-        """Return True if its time runs: all its devices have begun."""
+        """Return True if its time passes: all its devices have begun."""
         return self.begun and self.holder.waits is None
 
     def is_over(self, now: Ns) -> bool:
         return self.is_timed and now >= self.end and not self.holder.keep
 
     def take(self, holder: Holder, now: Ns) -> None:
-        """What was published of it, at its beginning or as its devices have begun."""
+        """Set the published `holder`, when it begins or when its devices have begun."""
         self.holder, self.end = holder, now + round(holder.remaining * SECOND)
         if holder.protected_from is not None:
             self.protected_from = self.end - round(holder.protected_from * SECOND)
 
     def state(self, now: Ns, waits: Ns | None) -> Holder:
-        """As it is now. `waits`: for how long this device has not begun, at most."""
+        """Return the holder with its remaining time. `waits`: the longest time until this device begins."""
         if self.is_timed:
             return structs.replace(self.holder, remaining=(self.end - now) / SECOND)
-        # All of its time is left. What protects it does not wait.
+        # All of its time is left; its protection does not wait.
         left, protected = self.holder.remaining, None
         if self.protected_from is not None:
             protected = left - (self.protected_from - now) / SECOND
@@ -82,7 +82,7 @@ class HoldEntry:
 
 
 class Settling(NamedTuple):
-    """A direct hold that has ended, and whose program may still touch the device."""
+    """An ended direct hold with a program that may still use the device."""
 
     client: str
     since: int
@@ -91,65 +91,67 @@ class Settling(NamedTuple):
 
 @dataclass(slots=True)
 class HoldChange:
-    """What an input changed: holders that were added or removed, and what the RC is to do about it."""
+    """The effect of an input: holders that were added or removed, and actions for the RC."""
 
     began: list[Holder] = field(default_factory=list)
     removed: list[Holder] = field(default_factory=list)
     expired_locally: list[EndedHold] = field(default_factory=list)
-    """Of the removed, those whose hold ended here by itself: by time, by lease, or as the device failed."""
+    """Removed holds that ended here by themselves: by time, by lease, or because the device failed."""
     stayed: bool = False
-    """Others hold the RC before and after."""
+    """True if other holders keep the RC before and after."""
     reread: bool = False
     """Something was missed: read `rcm/state`."""
     named: str | None = None
     """The instance of this RC that the RCM means."""
     named_host: HostName | None = None
-    """Its host, where that was said."""
+    """The host of this instance, if known."""
     announce: bool = False
-    """The RCM does not know what this RC holds, or is behind its term: publish its state."""
+    """Publish the RC's state: the RCM does not know its holds, or has a lower term."""
     settled: bool = False
-    """A program that the RC settled for is gone: its device is made safe once more, and whom that held back begins."""
+    """A program is gone that the RC settled for: make the device safe again, then let the held back holds begin."""
     entries: list[HoldEntry] = field(default_factory=list)
-    """Of the removed."""
+    """The entries of the removed holders."""
 
     def __bool__(self) -> bool:
         return bool(self.began or self.removed)
 
     @property
-    def going_on(self) -> dict[Grant, Holder]:
-        """Of the removed, those that go on, each by the grant of the one that it goes on in."""
+    def continued(self) -> dict[Grant, Holder]:
+        """Removed holders that continue, by the grant of the hold in which they continue."""
         found: dict[Grant, Holder] = {}
         for holder in self.removed:
-            into = (one.grant for one in self.began if one.grant not in found and goes_on(holder, one))
+            into = (new.grant for new in self.began if new.grant not in found and continues_as(holder, new))
             if (grant := next(into, None)) is not None:
                 found[grant] = holder
         return found
 
     @property
     def over(self) -> list[Holder]:
-        """Of the removed, those that go on in none that began."""
-        going_on = {holder.grant for holder in self.going_on.values()}
-        return [holder for holder in self.removed if holder.grant not in going_on]
+        """Removed holders that do not continue in a new hold."""
+        continued = {holder.grant for holder in self.continued.values()}
+        return [holder for holder in self.removed if holder.grant not in continued]
 
     @property
     def interrupts(self) -> bool:
-        """Whether the device serves nobody between what was before and what is after."""
+        """Return True if the device has no holder between the removed and the new ones."""
         return not self.stayed and self.over == self.removed
 
 
-def goes_on(before: Holder, after: Holder) -> bool:
-    """Whether one hold goes on in another, with no safe state in between: it was handed over (the same ARC has the same
-    id and place at another client; what was taken back from a client that is gone has its place only), or its client
-    has said so of another ARC of its own, which has all RCs of the first: a camera that goes on transmits on the
-    channel that it had. The program of a direct one is not known to be the same."""
+def continues_as(before: Holder, after: Holder) -> bool:
+    """Return True if the hold `before` continues as `after`, with no safe state in between.
+
+    Either it was handed over: the same ARC has the same id and place at another client. (An ARC taken back from a
+    vanished client keeps only its place, and does not continue.) Or the same client declared that `after` continues its
+    ARC, with all RCs of `before`: a camera then keeps its channel. A direct hold does not continue by declaration,
+    because its program may be another."""
     if _arc(before) == _arc(after):
         return before.client != after.client
-    said = before.client == after.client and before.arc == after.continues
-    return said and not (before.direct or after.direct) and set(before.rcs) <= set(after.rcs)
+    declared = before.client == after.client and before.arc == after.continues
+    return declared and not (before.direct or after.direct) and set(before.rcs) <= set(after.rcs)
 
 
 def _arc(holder: Holder) -> tuple[str, Place]:
-    """What an ARC keeps, whichever client has it."""
+    """The identity of an ARC, which it keeps at another client."""
     return holder.id, holder.place
 
 
@@ -159,47 +161,47 @@ def _named(holder: Holder) -> str:
 
 class HoldTable:
     def __init__(self, rc: str, *, hold_lease: Ns, settle: Ns = 0, instance: str = "", begins: bool = False) -> None:
-        """`begins`: the caller reports when the device has `begun` for a holder."""
+        """`begins`: the caller calls `begun` when the device has begun for a holder."""
         self.rc, self.instance, self._begins = rc, instance, begins
         self.hold_lease, self.settle = hold_lease, settle
         self.term: Term = NO_TERM
         """The newest term received or promised."""
         self.seq = 0
         self.last_contact: Ns = 0
-        """When an RCM that is obeyed last published, as received here."""
+        """When the last publication of an obeyed RCM was received."""
         self.held: dict[Grant, HoldEntry] = {}
         self.settling: dict[Grant, Settling] = {}
         self._events = 0
-        """Beginnings and ends of holds, so far."""
+        """Number of beginnings and ends of holds so far."""
         self._ended: OrderedDict[Grant, str] = OrderedDict()
         self._awaited: set[Grant] = set()
-        """Grants that a snapshot names while another hold is in force: their publication is still to come."""
+        """Grants that a snapshot named while another hold was in force: their publication has not arrived."""
 
     # Publications and snapshots
 
     def follow(self, grants: Grants, now: Ns) -> bool:
-        """Takes the next publication of the RCM that is obeyed, if it is about other RCs, as most are. False: it has to
-        be applied."""
+        """Take the next publication of the obeyed RCM if it concerns only other RCs, as most do. Return False if it
+        must be applied."""
         if grants.term != self.term or not grants.prev <= self.seq <= grants.seq or self.rc in grants.rcs:
             return False
         self.seq, self.last_contact = grants.seq, now
         return True
 
-    def apply_grants(self, grants: Grants, now: Ns, *, sharable: bool = True, stood_still: bool = False) -> HoldChange:
-        """Takes a publication. Of several holders of an exclusive RC only the newest grant is obeyed. `stood_still`:
-        this process did until just now, and so has heard nothing."""
+    def apply_grants(self, grants: Grants, now: Ns, *, sharable: bool = True, stalled: bool = False) -> HoldChange:
+        """Take a publication. If an exclusive RC has several holders, only the newest grant is obeyed. `stalled`: this
+        process has just stalled, and received nothing meanwhile."""
         missed = grants.term != self.term or grants.prev > self.seq
         change = HoldChange()
         if not self._accept(grants, change, now):
-            if grants.term == self.term and not stood_still and not self._heard(now):
-                # For a hold lease nothing newer came: what made this old was no RCM's. What stands is read.
+            if grants.term == self.term and not stalled and not self._in_contact(now):
+                # Nothing newer came for a hold lease, so the known seq was not from an RCM: read the current state.
                 self.seq, change.reread = grants.seq, True
             return change
         change.reread = missed
         holders = grants.rcs.get(self.rc)
         if holders is None:
             return change
-        # An RCM that names none means whoever hears it.
+        # An RCM that names no instance means every receiver.
         change.named = grants.instances.get(self.rc, self.instance)
         if change.named != self.instance:
             self._end_all("another instance of this device serves", change, now)
@@ -227,10 +229,10 @@ class HoldTable:
     def apply_snapshot(
         self, state: RcmState, now: Ns, carries: Callable[[Collection[Holder]], bool] = lambda _: False
     ) -> HoldChange:
-        """Takes a snapshot: what was missed is added, what the snapshot does not know is announced.
+        """Take a snapshot: add missed holds, and announce holds that it lacks.
 
-        It ends nothing but older holds of what it names, so what is still held here may be over: beside that only such
-        a holder begins with whom the device `carries` them all, and an exclusive one carries no second."""
+        It ends only older holds of the ARCs that it names, so holds in force here may be over. Beside them a new hold
+        begins only if the device `carries` all of them; an exclusive device never does."""
         change = HoldChange()
         if not self._accept(state, change, now):
             return change
@@ -248,7 +250,7 @@ class HoldTable:
             if view.grant in self.held:
                 self._retime(holder, now)
                 continue
-            # An ARC has one hold: its older one is over.
+            # An ARC has one hold: its older hold is over.
             older = [grant for grant, held in self.held.items() if _arc(held.holder) == _arc(holder)]
             others = [held.holder for grant, held in self.held.items() if grant not in older]
             if self.held and not carries([*others, holder]):
@@ -256,12 +258,12 @@ class HoldTable:
                 self._awaited.add(view.grant)
                 continue
             for grant in older:
-                self._remove(grant, "it was granted anew", change, now, to=[holder])
+                self._remove(grant, "it was granted again", change, now, to=[holder])
             self._begin(holder, change, now)
         return change
 
     def _accept(self, update: Grants | RcmState, change: HoldChange, now: Ns) -> bool:
-        """Whether this is obeyed: it is not older than what is known, and its term no absurd jump."""
+        """Return True if the update is obeyed: not older than the known state, and its term plausible."""
         if (update.term, update.seq) < (self.term, self.seq):
             change.announce = update.term < self.term
             return False
@@ -271,21 +273,21 @@ class HoldTable:
         return True
 
     def believes(self, term: Term, now: Ns) -> bool:
-        """Whether `term` is no absurd jump."""
-        return not absurd(term, self.term, heard=self._heard(now))
+        """Return True if `term` is plausible: not an absurd jump."""
+        return not absurd(term, self.term, heard=self._in_contact(now))
 
-    def _heard(self, now: Ns) -> bool:
+    def _in_contact(self, now: Ns) -> bool:
         return now - self.last_contact < self.hold_lease
 
     def catch_up(self, term: Term) -> None:
-        """Others have promised `term`."""
+        """Other RCs have promised `term`."""
         if term > self.term:
             self.term, self.seq = term, 0
 
     def promise(self, term: Term, now: Ns, *, above: bool = False) -> bool:
-        """Obeys no lower term again. False: a higher one is known, or the jump is absurd, unless the fleet must go
-        `above` one that an RC obeys already."""
-        if term < self.term or absurd(term, self.term, heard=self._heard(now) and not above):
+        """Promise to obey no lower term again. Return False if a higher term is known, or if the jump is absurd;
+        `above` permits large jumps, because the fleet must get above a term that an RC already obeys."""
+        if term < self.term or absurd(term, self.term, heard=self._in_contact(now) and not above):
             return False
         if term != self.term:
             self.term, self.seq = term, 0
@@ -294,7 +296,7 @@ class HoldTable:
     # Time
 
     def expire(self, now: Ns, *, lease: bool = True) -> HoldChange:
-        """Ends what is over. Holds that may be kept end only with the lease."""
+        """End the holds that are over. Holds that may be kept end only with the lease."""
         change = HoldChange()
         lease_over = lease and self.held and now - self.last_contact >= self.hold_lease
         for grant, held in list(self.held.items()):
@@ -307,7 +309,7 @@ class HoldTable:
         return change
 
     def next_expiry(self) -> Ns | None:
-        """When `expire` should be called next."""
+        """When to call `expire` next."""
         ends = [held.end for held in self.held.values() if held.is_timed and not held.holder.keep]
         if self.held:
             ends.append(self.last_contact + self.hold_lease)
@@ -321,13 +323,13 @@ class HoldTable:
     # Settling
 
     def confirmed(self, grant: Grant, now: Ns) -> None:
-        """A client has confirmed a hold in force: if it is direct, its program may run from now on."""
+        """A client confirmed a hold in force: the program of a direct hold may run from now on."""
         held = self.held[grant]
         if held.holder.direct:
             held.gone_by = now + self.hold_lease + self.settle
 
     def leaving(self, grant: Grant, client: str, now: Ns) -> HoldChange | Problem:
-        """The client has heard of the end of its hold, and its program is gone a `settle` from now."""
+        """The client knows that its hold has ended; its program is gone within `settle`."""
         return self._bound(grant, client, now, now + self.settle)
 
     def left(self, grant: Grant, client: str, now: Ns) -> HoldChange | Problem:
@@ -348,16 +350,16 @@ class HoldTable:
         return change
 
     def settle_at_start(self, now: Ns) -> None:
-        """Somebody may have held this RC directly before it started."""
+        """Settle because a direct hold may have been in force before this RC started."""
         self.settling[BEFORE] = Settling("", 0, now + self.hold_lease + self.settle)
 
     def settles(self, grant: Grant) -> Ns | None:
-        """Until when, at the latest, a hold in force is held back; None: it is not."""
+        """The latest time until which a hold in force is held back, or None."""
         since = self.held[grant].since
-        return max((one.gone_by for one in self.settling.values() if one.since < since), default=None)
+        return max((other.gone_by for other in self.settling.values() if other.since < since), default=None)
 
     def may_be_direct(self, now: Ns) -> bool:
-        """Whether somebody's program may touch the device past this RC."""
+        """Return True if a program may use the device past this RC."""
         return bool(self.settling) or any(
             held.gone_by is not None and held.gone_by > now for held in self.held.values()
         )
@@ -371,8 +373,8 @@ class HoldTable:
     # Commands
 
     def check(self, grant: Grant, client: str, now: Ns) -> Problem | None:
-        """Why a command of `client` under `grant` is not obeyed at this moment; None: it is. Codes are part
-        of the protocol."""
+        """Return why a command of `client` under `grant` is refused now, or None if it is obeyed. Codes are part of the
+        protocol."""
         held = self.held.get(grant)
         newer = (grant.term, grant.seq) > (self.term, self.seq) and not absurd(grant.term, self.term)
         if held is not None and held.holder.client != client:
@@ -384,23 +386,22 @@ class HoldTable:
         elif grant in self._ended:
             code, why = "ended", f"the hold of {self.rc} is over: {self._ended[grant]}"
         elif newer or grant in self._awaited:
-            code, why = "not_yet", f"{self.rc} has not heard of this grant"
+            code, why = "not_yet", f"{self.rc} does not know this grant yet; try again"
         elif not self.held:
-            code, why = "free", f"{self.rc} is held by nobody; request it"
+            code, why = "free", f"{self.rc} is free; request it first"
         else:
             holders = ", ".join(sorted(_named(held.holder) for held in self.held.values()))
             code, why = "not_holder", f"{self.rc} is held by {holders}"
         return Problem(code, why, self.term)
 
     def holders(self, now: Ns, waits: Mapping[Grant, Ns] = MappingProxyType({})) -> list[Holder]:
-        """The holders, with the time that each has left now. `waits`: for how long the device has not begun for one,
-        at most."""
+        """The holders with their remaining time. `waits`: by grant, the longest time until the device begins."""
         return [held.state(now, waits.get(grant)) for grant, held in self.held.items()]
 
     # Beginning
 
     def begun(self, grant: Grant, now: Ns, *, late: bool = False) -> None:
-        """The device has begun for a hold in force. `late`: not at its grant, so that its time begins now."""
+        """The device has begun for a hold in force. `late`: some time after the grant, so its time begins now."""
         entry = self.held[grant]
         if not entry.begun:
             entry.begun = True
@@ -408,7 +409,7 @@ class HoldTable:
                 entry.end = now + round(entry.holder.remaining * SECOND)
 
     def _retime(self, holder: Holder, now: Ns) -> None:
-        """The leader publishes a hold in force again: its devices have begun, or not yet."""
+        """The leader published a hold in force again: if its `waits` appeared or ended, take its new times."""
         entry = self.held[holder.grant]
         if (entry.holder.waits is None) is not (holder.waits is None):
             entry.take(holder, now)
@@ -420,8 +421,8 @@ class HoldTable:
         entry = HoldEntry(holder, now, self._events, begun=not self._begins)
         entry.take(holder, now)
         for before in change.entries:
-            if goes_on(before.holder, holder):
-                # It goes on: it is held back by no more than it was, and its program may be the one of before.
+            if continues_as(before.holder, holder):
+                # Nothing more holds it back than before, and its program may be the same.
                 entry.since, entry.gone_by, entry.begun = before.since, before.gone_by, before.begun
         self.held[holder.grant] = entry
         change.began.append(holder)
@@ -441,13 +442,13 @@ class HoldTable:
         expired: str | None = None,
         to: Collection[Holder] = (),
     ) -> None:
-        """`to`: who holds the RC afterwards."""
+        """`to`: the holders afterwards."""
         entry = self.held.pop(grant)
         holder = entry.holder
         change.removed.append(holder)
         change.entries.append(entry)
         self._events += 1
-        if entry.gone_by is not None and entry.gone_by > now and not any(goes_on(holder, other) for other in to):
+        if entry.gone_by is not None and entry.gone_by > now and not any(continues_as(holder, other) for other in to):
             self.settling[grant] = Settling(holder.client, self._events, entry.gone_by)
         change.stayed = len(self.held) > len(change.began)
         if expired is not None:

@@ -316,8 +316,8 @@ class ResourceController:
 
     def _apply_grants(self, grants: messages.Grants, now: Ns) -> HoldChange:
         self._last_terms.shown(grants.term, self.holds.term)
-        sharable, stood_still = self.driver.sharable, self.stall.fresh()
-        return self.holds.apply_grants(grants, now, sharable=sharable, stood_still=stood_still)
+        sharable, stalled = self.driver.sharable, self.stall.fresh()
+        return self.holds.apply_grants(grants, now, sharable=sharable, stalled=stalled)
 
     def _on_state_query(self, query: IncomingQuery[messages.RcAsk]) -> None:
         if query.message.above is None:
@@ -570,7 +570,7 @@ class ResourceController:
             if holder.grant in self._at_driver:
                 await self._guard(self.driver.end(holder))
         before = {one.grant for one in change.removed} & self._at_driver
-        going_on = change.going_on
+        continued = change.continued
         self._at_driver -= before
         self._entered -= before
         for holder in change.removed:
@@ -579,7 +579,7 @@ class ResourceController:
         if (before and change.interrupts) or (change.settled and not self._at_driver):
             await self._make_safe()
         for holder in change.began:
-            former = going_on.get(holder.grant)
+            former = continued.get(holder.grant)
             if former is not None and former.grant in before:
                 await self._begin(holder, self.driver.carry_on(former, holder))
             else:
@@ -690,8 +690,8 @@ class ResourceController:
         if change.named is not None:
             self.instances.take(change.named, change.named_host)
         if change:
-            going_on = {grant: former.grant for grant, former in change.going_on.items()}
-            self._tolerance.changed(self.holds.held.keys(), going_on, self.mesh.now())
+            continued = {grant: former.grant for grant, former in change.continued.items()}
+            self._tolerance.changed(self.holds.held.keys(), continued, self.mesh.now())
         if change or change.settled:
             self._waits_said -= {holder.grant for holder in change.removed}
             for holder in change.removed:
