@@ -30,7 +30,7 @@ from tests.mesh.kit import until
 from zscout.drivers.confirm_server import CommandQuery, ConfirmServer
 from zscout.drivers.holds import HoldChange
 from zscout.drivers.repeated import MAX_HOSTS, MAX_PER_HOST, MAX_WAITING, CommandMemory
-from zscout.drivers.resource_controller import SAY_AGAIN, ResourceController
+from zscout.drivers.resource_controller import REPUBLISH_PERIOD_S, ResourceController
 from zscout.drivers.work_queue import COMMANDS_PER_HOST, EARLY_PER_HOST, WorkQueue
 from zscout.keyexpr import Role, Sender
 from zscout.mesh import IncomingQuery, Mesh, Refused
@@ -364,7 +364,7 @@ async def test_who_missed_that_an_rc_works_again_hears_it_later() -> None:
     await asyncio.sleep(1)
     network.disturb({})
     assert seen == ["no power"]
-    await until(lambda: seen[-1] == "ok", within=SAY_AGAIN + 2)
+    await until(lambda: seen[-1] == "ok", within=REPUBLISH_PERIOD_S + 2)
     await close(rc, watcher)
 
 

@@ -39,43 +39,45 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-MIN_DELAY = 0.02
-"""Seconds until a hold that is over is looked at again."""
+MIN_EXPIRY_DELAY_S = 0.02
+"""Until overdue holds are checked again."""
 MAX_TTL = 60.0
 LEADERLESS = 5.0
 """Seconds: longer than an election takes."""
 REREAD_TIMEOUT = 0.5
-"""Seconds that one query for `rcm/state` waits for an answer."""
+"""Seconds for the answer to one query for `rcm/state`."""
 REREADS = 4
 """Queries in a row when publications overtake the answers."""
 SETTLE: Final = devices.SETTLE / SECOND
-"""Seconds from the end of a direct hold, as its client heard of it, in which its program must be gone; and within which
-a device must be safe."""
-AT_ONCE: Final = 0.1
-"""Seconds for which what comes next waits for a device that is being made safe; then it is answered `settling`."""
+"""Seconds within which a program must be gone, from when its client learned of the end of its direct hold. Also the
+time within which a device must be safe."""
+SAFE_WAIT_S: Final = 0.1
+"""How long the next work waits until the device is safe. Later commands are answered `settling`."""
 NEVER_HELD_BACK: Final = ("stop", "halt")
 COMMAND_QUEUE = 64
-EARLY: Final = 0.25
-"""Seconds for which a command under a grant that is not known yet waits for its publication."""
+EARLY_WAIT_S: Final = 0.25
+"""How long a command under an unknown grant waits for the publication of this grant."""
 INFORMED_WITHIN: Final = 1.0
-"""Seconds from its start in which an RC hears of a leader, if there is one."""
-LOOK_PERIOD = 0.5
-"""Seconds between two looks at whether leaders that are seen are heard, and ask."""
+"""Seconds from its start until an RC knows the leader, if there is one."""
+CHECK_PERIOD_S = 0.5
+"""Between two checks that the visible leaders publish and ask for promises."""
 FIGURES_PERIOD = 1.0
 """Seconds between two publications of changed figures."""
-SAYS_WAITS: Final = 0.05
-"""Seconds after which an RC that has not begun for a new holder publishes that this one waits."""
-LOOK_BEGUN: Final = 0.1
-"""Seconds between two looks at whether a device has begun."""
-SAY_AGAIN = 10.0
-"""Seconds after which an RC publishes its state though nothing has changed: who missed a change hears of it then."""
+WAITS_DELAY_S: Final = 0.05
+"""After this time an RC publishes that a new holder waits for the device to begin."""
+BEGUN_POLL_S: Final = 0.1
+"""Between two checks whether a device has begun."""
+REPUBLISH_PERIOD_S = 10.0
+"""An RC publishes an unchanged state after this time, for receivers that missed a change."""
 
 
 class ResourceController:
-    """One RC: its keys, its holds and its driver. Where it fails, not its driver, it leaves the mesh, makes
-    its device safe and calls `on_failure`. `hold_lease`, `settle` and `begin_within` (None: what its driver says) are
-    in seconds; without a `tolerance` it is lost once it is not well; `last_holder` outlives it;
-    `confirmations` is that of all RCs of its process, its own if there is none."""
+    """One RC: its keys, its holds and its driver. If the RC itself fails, rather than its driver, it leaves the mesh,
+    makes its device safe and calls `on_failure`.
+
+    `hold_lease`, `settle` and `begin_within` are in seconds; `begin_within` defaults to the driver's. Without a
+    `tolerance` an unwell device is lost at once. `last_holder` outlives the RC. `confirmations` is shared by all RCs of
+    the process; by default the RC has its own."""
 
     def __init__(
         self,
@@ -98,7 +100,7 @@ class ResourceController:
         self.holds = HoldTable(name, hold_lease=lease, settle=self._settle, instance=self.instance, begins=True)
         self._begin_within = begin_within
         self._longest_begin = 0.0
-        """Seconds: the longest that its driver has announced for a hold."""
+        """Seconds: the longest beginning that its driver has announced."""
         self._last_holder, self._noting = last_holder or LastHolder(), asyncio.Lock()
         self._confirmations = confirmations or ConfirmServer(mesh)
         self.rules = 0
@@ -116,50 +118,50 @@ class ResourceController:
         )
         self._leaders: set[Token] = set()
         self._asked: Term = NO_TERM
-        """The term that it has promised to who asked it, not another instance."""
-        self._heard: Ns | None = None
-        """When the RCM that it obeys published last, as far as that was heard. What it answers is no sign of it."""
+        """The newest term promised to a query to this instance."""
+        self._last_published: Ns | None = None
+        """When the last publication of the obeyed RCM arrived. Its answers do not count."""
         self._is_open = False
-        """Whether its driver is."""
+        """True while its driver is open."""
         self._served: list[Declaration] = []
-        """What it answers, by its standing among the instances of this RC."""
+        """Its queryables, which depend on its state among the instances of this RC."""
         self._declared: list[Declaration] = []
         self._warm_at: Ns = 0
         self._at_driver: set[Grant] = set()
         """Holds that have begun at the driver."""
         self._held_back: dict[Grant, messages.Holder] = {}
-        """Those that have not yet: a former holder's program may be there still, or the device is being made safe."""
+        """Holds that have not: a former holder's program may still use the device, or it is being made safe."""
         self._entered: set[Grant] = set()
-        """Of those, the ones whose `begin` has returned: the device may still be starting."""
-        self._waits_said: set[Grant] = set()
-        """Holds that it has published as waiting for their device."""
+        """Holds whose `begin` at the driver has returned: the device may still be starting."""
+        self._published_waits: set[Grant] = set()
+        """Holds that were published as waiting for the device."""
         self._beginning: asyncio.Task[None] | None = None
-        """Looks when its device has begun."""
+        """Polls until the device has begun."""
         self._making_safe: asyncio.Task[None] | None = None
         self._safe_by: Ns = 0
-        """When that must be done."""
+        """When `_making_safe` must be done."""
         self._safe_again = False
-        """Whether it is to be done once more when it is done."""
+        """True if the device must be made safe again after `_making_safe`."""
         self._last_terms = LastTerms(mesh, self.supervisor, self.holds.catch_up, timeout=REREAD_TIMEOUT)
         self._reading: asyncio.Task[None] | None = None
         self._missed = False
-        """Something was missed that has not been read since."""
+        """True if it missed something and has not read `rcm/state` since."""
         self.informed = asyncio.Event()
         self._published = mesh.now()
-        """When it published its state last."""
+        """When it last published its state."""
         self._alarm = Alarm(mesh.now, self.supervisor, self._expire)
         self._waits_timer: asyncio.TimerHandle | None = None
-        """While there are holders for whom its device has not begun, and who have not been published as waiting."""
+        """Runs while the device has not begun for some holders that were not published as waiting."""
         self._stopping: asyncio.Task[None] | None = None
 
     async def start(self) -> None:
-        """Starts empty, and obeys nothing before it has subscribed and then read `rcm/state`."""
+        """Start without holds. Obey no command before subscribing to grants and then reading `rcm/state`."""
         keys, mesh, guard = self.mesh.keys, self.mesh, self.supervisor.guard
         self._state = mesh.publisher(keys.rc_state(self.name), messages.RcState)
         self._declared.append(mesh.watch(keys.alive_any(Role.RCM), guard(self._on_leader)))
         self._declared.append(self.instances.watch())
         if self._last_holder.may_be_direct:
-            log.warning("%s settles: it may have been held directly before it started", self.name)
+            log.warning("%s settles: a direct hold may have been in force before its start", self.name)
             self.holds.settle_at_start(mesh.now())
             self._set_alarm()
         self._declared.append(mesh.subscribe(keys.grants, messages.Grants, guard(self._on_grants)))
@@ -167,14 +169,14 @@ class ResourceController:
         self.supervisor.call_later(INFORMED_WITHIN, self.informed.set)
         if self.directory is not None:
             self._declared.append(self.directory.watch())
-        # Where another instance is there, its holder has the device: a driver that begins leaves it alone.
+        # If another instance is there, its holder may have the device: the driver must not touch it on opening.
         self.instances.begin()
         await self.driver.open(self)
-        # What its driver says of it is what others can read, or it is not offered at all. Raises Malformed.
+        # Raises Malformed if the driver's figures, capacity or parameters are unreadable: it is not offered then.
         messages.decode(messages.encode(self._rc_state([])), messages.RcState)
         self.supervisor.spawn(self._worker())
         self.supervisor.spawn(self._publish_figures())
-        self.supervisor.spawn(self._keep_looking())
+        self.supervisor.spawn(self._keep_checking())
         self._is_open = True
         self._serve()
         self._declared.append(mesh.alive(Token(mesh.me.host, Role.RC, self.name, self.instance)))
@@ -202,7 +204,7 @@ class ResourceController:
             self.publish()
 
     async def stop(self) -> None:
-        """Leaves the mesh and puts the device into its safe state; once, however often it is called."""
+        """Leave the mesh and put the device into its safe state. Can be called several times."""
         if self._stopping is None:
             self._stopping = asyncio.get_running_loop().create_task(self._stop())
         await asyncio.shield(self._stopping)
@@ -212,10 +214,10 @@ class ResourceController:
         for declared in (*self._served, *reversed(self._declared)):
             declared.close()
         await self.supervisor.close()
-        # While another instance serves, that one's holder has the device.
+        # While another instance serves, its holder has the device.
         if self.instances.state is not InstanceState.STANDS_BY or self._at_driver:
             await self._guard(self._make_safe_in_time())
-        # Where a program may still touch the device, another instance is not taken at once.
+        # If a program may still use the device, the RCM must not choose another instance at once.
         self._state.put(self._rc_state([], leaving=not self._last_holder.may_be_direct))
         await self._guard(self.driver.close())
         self._state.close()
@@ -223,9 +225,9 @@ class ResourceController:
     def _failed(self, error: Exception) -> None:
         self._stopping = asyncio.get_running_loop().create_task(self._stop())
         self._on_failure(error)
-        self.fail(f"its resource controller failed: {error}")  # which may fail as well
+        self.fail(f"its resource controller failed: {error}")  # this may raise as well
 
-    # For the driver: see RcHandle
+    # RcHandle, for the driver
 
     def now(self) -> Ns:
         return self.mesh.now()
@@ -253,7 +255,7 @@ class ResourceController:
             self._set_alarm()
 
     def _lost_by_now(self) -> bool:
-        """Whether it has been unwell for longer than is tolerated; then it is lost."""
+        """Return True if the device has been unwell for longer than is tolerated, and mark it as lost."""
         at, why = self._tolerance.lost_at, self._tolerance.why
         if at is None or at > self.mesh.now():
             return False
@@ -285,7 +287,7 @@ class ResourceController:
 
     @property
     def begin_within(self) -> float:
-        """Seconds, at most, from a grant until it has begun, without what settles."""
+        """The longest time in seconds from a grant until the device has begun, without settling."""
         own = self._begin_within
         return max(self.driver.begin_within, self._longest_begin) if own is None else own
 
@@ -293,7 +295,7 @@ class ResourceController:
         self._published, self._use.unpublished = self.mesh.now(), False
         self._state.put(self._rc_state(ended or []))
 
-    # What the RCM sends
+    # Messages of the RCM
 
     def _on_leader(self, token: Token, alive: bool) -> None:
         (self._leaders.add if alive else self._leaders.discard)(token)
@@ -303,10 +305,10 @@ class ResourceController:
 
     def _on_grants(self, _key: str, grants: messages.Grants) -> None:
         now, before = self.mesh.now(), (self.holds.term, self.holds.seq)
-        # The timer of a lease is set anew when it goes off: most leases are renewed before.
+        # The timer of a lease is not moved here: when it fires it is set again, as most leases are renewed in time.
         change = None if self.holds.follow(grants, now) else self._apply_grants(grants, now)
         if grants.term == self.holds.term:
-            self._heard = now
+            self._last_published = now
         if change or before != (self.holds.term, self.holds.seq):
             self._trace("hear")
         if change is not None:
@@ -326,7 +328,7 @@ class ResourceController:
             self.supervisor.spawn(self._promise_above(query, query.message.above))
 
     def _on_question(self, query: IncomingQuery[messages.RcAsk]) -> None:
-        """Of somebody who may not ask for a promise."""
+        """Answer a query from a sender that may not ask for a promise."""
         query.answer(self._rc_state([]))
 
     async def _promise_above(self, query: IncomingQuery[messages.RcAsk], host: str) -> None:
@@ -351,23 +353,23 @@ class ResourceController:
 
     def _rc_state(self, ended: list[messages.EndedHold], *, leaving: bool = False) -> messages.RcState:
         waits = {} if leaving else self._waits()
-        self._waits_said |= waits.keys()
-        # A leader counts while it publishes: its token outlives a program that hangs.
+        self._published_waits |= waits.keys()
+        # A leader counts only while it publishes: the token of a hanging program remains.
         return messages.RcState(
             rc=self.name,
             host=self.mesh.me.host,
             instance=self.instance,
             sharable=self.driver.sharable,
             term=self.holds.term,
-            # An RCM takes what one that knows all does not name for lost.
+            # 0 means incomplete: from a complete state, an RCM takes missing holds for lost.
             seq=0 if self._missed else self.holds.seq,
             holders=self.holds.holders(self.mesh.now(), waits),
             ended=ended,
             health=self.health,
             unwell=self._unwell(),
             rules=self.rules,
-            leader=self._hears and bool(self._leaders),
-            # The driver is asked nothing any more: it may be the one that failed.
+            leader=self._receives and bool(self._leaders),
+            # When leaving, the driver is not called any more: it may have failed.
             capacity={} if leaving else self.driver.capacity(),
             figures={} if leaving else self._figures(),
             duplicate_of=self.instances.duplicate_of,
@@ -381,7 +383,7 @@ class ResourceController:
 
     @property
     def unwell_for(self) -> float:
-        """Seconds; 0: it is well, or lost."""
+        """Seconds; 0 if the device is well or lost."""
         return (self.mesh.now() - self._tolerance.since) / SECOND if self._tolerance.why else 0.0
 
     def _unwell(self) -> messages.Unwell | None:
@@ -391,7 +393,7 @@ class ResourceController:
         return messages.Unwell(self._tolerance.why, self.unwell_for, max(0, at - self.mesh.now()) / SECOND)
 
     def _figures(self) -> messages.Figures:
-        """No message has a number that is none."""
+        """The driver's figures without NaN and infinity, which messages can't carry."""
         return {name: value for name, value in self.driver.figures().items() if math.isfinite(value)}
 
     def _on_proposal(self, query: IncomingQuery[messages.Proposal]) -> None:
@@ -405,21 +407,21 @@ class ResourceController:
     # Commands
 
     def _on_command(self, query: CommandQuery) -> None:
-        sender = self.mesh.keys.sender_of(query.key)  # one without a valid name is refused here
+        sender = self.mesh.keys.sender_of(query.key)  # refuses invalid names
         if not self._memory.is_new(sender, query):
             return
-        # What stops a robot is let in where commands are not.
+        # Commands without a grant, which stop robots, have room of their own.
         room = COMMAND_QUEUE if query.message.grant is not None else 2 * COMMAND_QUEUE
         if self.queue.commands >= room:
             raise Refused("busy", f"{self.name} has {COMMAND_QUEUE} commands waiting; try again")
         if not 0 < query.message.ttl <= MAX_TTL:
             raise Refused("bad_command", f"ttl must lie between 0 and {MAX_TTL:g} seconds")
-        # Nor does what stops one wait for what else its host has sent.
+        # They do not count against the limit of their host either.
         if not self.queue.put_command(query, sender.host if query.message.grant is not None else ""):
             raise Refused("busy", f"{COMMANDS_PER_HOST} commands of {sender.host} to {self.name} wait; try again")
 
     async def _worker(self) -> None:
-        """Carries out changes of holders and commands, one at a time."""
+        """Carry out hold changes and commands, one at a time."""
         while True:
             work = await self.queue.get()
             if isinstance(work, HoldChange):
@@ -427,9 +429,9 @@ class ResourceController:
             elif not self._is_early(work):
                 await self._answer(work, self._carry_out(work))
             elif self.queue.set_aside(work, self.mesh.keys.sender_of(work.key).host):
-                # Who is granted hears of it before its RCs do: most are published by then.
+                # A client can know its grant before the RCs do. Most grants are published within this wait.
                 left = work.message.ttl - self._waited(work) / SECOND
-                self.supervisor.call_later(max(0.0, min(EARLY, left)), self._read_for_early)
+                self.supervisor.call_later(max(0.0, min(EARLY_WAIT_S, left)), self._read_for_early)
             else:
                 work.refuse(Refused("busy", f"too many early commands for {self.name}; try again").problem)
 
@@ -438,7 +440,7 @@ class ResourceController:
             self._read_state()
 
     async def _carry_out(self, query: CommandQuery) -> Any:
-        """What is answered, or a Future of it."""
+        """Return the answer, or a Future of it."""
         command = query.message
         sender = self.mesh.keys.sender_of(query.key)
         if self._is_stale(query):
@@ -447,10 +449,10 @@ class ResourceController:
         if command.grant is None:
             return await self.driver.command_without_grant(sender, command.do)
         if (name := command.do.get("name")) in ("leaving", "left"):
-            return self._hear_program(command.grant, str(sender), gone=name == "left")
+            return self._on_program_end(command.grant, str(sender), gone=name == "left")
         self._raise_refusal(query)
         if name == "confirm":
-            # What is written to disk for it is waited for by nothing else.
+            # Only the confirmation waits for the write to disk, not other work.
             direct = self.holds.held[command.grant].holder.direct
             return asyncio.ensure_future(self._confirm_direct(query)) if direct else self._confirm(command.grant)
         if name == "expect_outage":
@@ -474,13 +476,13 @@ class ResourceController:
         if not done.cancelled() and done.exception() is None:
             self._use.carried_out(grant, began, self.mesh.now())
 
-    def _hear_program(self, grant: Grant, client: str, *, gone: bool) -> messages.Done:
-        """What the client of a direct hold says of its program. Raises Refused."""
-        hear = self.holds.left if gone else self.holds.leaving
-        heard = hear(grant, client, self.mesh.now())
-        if isinstance(heard, messages.Problem):
-            raise Refused.by(heard)
-        self._apply(heard)
+    def _on_program_end(self, grant: Grant, client: str, *, gone: bool) -> messages.Done:
+        """The client of a direct hold reports that its program is leaving, or `gone`. Raises Refused."""
+        report = self.holds.left if gone else self.holds.leaving
+        result = report(grant, client, self.mesh.now())
+        if isinstance(result, messages.Problem):
+            raise Refused.by(result)
+        self._apply(result)
         return messages.Done()
 
     def _confirm(self, grant: Grant) -> messages.Done:
@@ -489,24 +491,24 @@ class ResourceController:
         return messages.Done(warming=warming, settle=self._settle / SECOND)
 
     async def _confirm_direct(self, query: CommandQuery) -> messages.Done:
-        """A direct holder is noted before it may rely on its hold. Raises Refused."""
+        """Note the direct holder on disk before confirming its hold. Raises Refused."""
         grant = query.message.grant
         async with self._noting:
             if not self._last_holder.may_be_direct:
                 try:
                     await self._last_holder.note(direct=True)
                 except OSError as error:
-                    why = f"{self.name} can't note that it is held directly ({error}): see to its node's state folder"
+                    why = f"{self.name} can't note its direct hold on disk ({error}); check the state folder of its node"
                     raise Refused("failed", why) from None
             self._raise_refusal(query)
-            assert grant is not None  # noqa: S101 - or it had been refused
+            assert grant is not None  # noqa: S101 - commands without a grant do not come here
             self.holds.confirmed(grant, self.mesh.now())
         return self._confirm(grant)
 
     async def _forget_direct(self) -> None:
         async with self._noting:
             if self._last_holder.may_be_direct and not self.holds.may_be_direct(self.mesh.now()):
-                with suppress(OSError):  # then it settles once more than it need
+                with suppress(OSError):  # then it settles once more than necessary
                     await self._last_holder.note(direct=False)
 
     def _raise_refusal(self, query: CommandQuery) -> None:
@@ -514,7 +516,7 @@ class ResourceController:
             raise Refused.by(problem)
 
     def _refusal(self, query: CommandQuery) -> messages.Problem | None:
-        """Why a command is not obeyed under its grant; None: it is, or has none."""
+        """Return why a command is not obeyed under its grant, or None if it is obeyed or has no grant."""
         grant, sender = query.message.grant, self.mesh.keys.sender_of(query.key)
         if grant is None:
             return None
@@ -523,12 +525,12 @@ class ResourceController:
             client = held.holder.client
         problem = self.holds.check(grant, client, self.mesh.now())
         if self._missed and problem is not None and problem.code in ("free", "not_holder"):
-            # What is being read may name it.
+            # The state that is being read may contain the grant.
             return structs.replace(problem, code="not_yet", message=f"{self.name} is catching up; try again")
         if problem is None and grant in self._held_back and query.message.do.get("name") not in NEVER_HELD_BACK:
             until = max(self.holds.settles(grant) or 0, 0 if self._making_safe is None else self._safe_by)
             left = max(0.0, (until - self.mesh.now()) / SECOND)
-            words = f"{self.name} is settling: a former holder may still touch it; wait at most {left:.1f} s"
+            words = f"{self.name} is settling: a former holder may still use it; wait at most {left:.1f} s"
             return messages.Problem("settling", words, left=left)
         if (
             problem is None
@@ -539,7 +541,7 @@ class ResourceController:
         return problem
 
     def _waited(self, query: CommandQuery) -> Ns:
-        """How long a command may have waited: in our queue, and before it in the network through a stall."""
+        """The longest time that a command may have waited: in the queue here, and in the network during a stall."""
         return self.mesh.now() - query.arrived + self.stall.waited_through(query.arrived)
 
     def _is_stale(self, query: CommandQuery) -> bool:
@@ -556,10 +558,10 @@ class ResourceController:
             query.refuse(refused.problem)
         except Exception:
             log.exception("%s: a command failed", self.name)
-            query.refuse(Refused("failed", f"{self.name} could not do it; see the log of its node").problem)
+            query.refuse(Refused("failed", f"the command failed at {self.name}; see the log of its node").problem)
 
     def _is_early(self, query: CommandQuery) -> bool:
-        """Whether a command comes under a grant that this RC does not know yet."""
+        """Return True if the command has a grant that this RC does not know yet."""
         problem = self._refusal(query)
         return problem is not None and problem.code == "not_yet" and not self._is_stale(query)
 
@@ -569,13 +571,13 @@ class ResourceController:
         for holder in change.over:
             if holder.grant in self._at_driver:
                 await self._guard(self.driver.end(holder))
-        before = {one.grant for one in change.removed} & self._at_driver
+        before = {holder.grant for holder in change.removed} & self._at_driver
         continued = change.continued
         self._at_driver -= before
         self._entered -= before
         for holder in change.removed:
             self._held_back.pop(holder.grant, None)
-        # A device that still serves others, or goes on in another hold, stays as it is.
+        # A device that still serves other holders, or continues in another hold, stays as it is.
         if (before and change.interrupts) or (change.settled and not self._at_driver):
             await self._make_safe()
         for holder in change.began:
@@ -589,44 +591,44 @@ class ResourceController:
             self.supervisor.spawn(self._forget_direct())
 
     async def _begin_held_back(self, *, at_once: Collection[messages.Holder]) -> None:
-        """Has those begin at the driver for whom nothing is in the way any more. One that has ended by now is left out,
-        and so is its end."""
+        """Begin the holds at the driver that nothing holds back any more. Holds that have ended meanwhile are skipped,
+        and their `end` too."""
         if self._making_safe is not None:
             return
         for grant, holder in list(self._held_back.items()):
             if grant in self.holds.held and self.holds.settles(grant) is None:
                 del self._held_back[grant]
                 if not self._at_driver and holder not in at_once:
-                    # The device warms up from now on, though it was granted before.
+                    # The device was granted earlier, but warms up from now on.
                     self._warm_at = self.mesh.now() + round(self.driver.activation * SECOND)
                 await self._begin(holder, self.driver.begin(holder))
 
-    async def _begin(self, holder: messages.Holder, how: Awaitable[None]) -> None:
+    async def _begin(self, holder: messages.Holder, beginning: Awaitable[None]) -> None:
         self._at_driver.add(holder.grant)
         if holder.direct:
             self._use.direct_began(holder.grant, self.mesh.now())
-        await self._guard(how)
+        await self._guard(beginning)
         self._entered.add(holder.grant)
         if left := self.driver.begins_for():
             self._longest_begin = max(self._longest_begin, left)
             if self._waits():
                 self.publish()
             if self._beginning is None or self._beginning.done():
-                self._beginning = self.supervisor.spawn(self._look_until_begun())
+                self._beginning = self.supervisor.spawn(self._poll_until_begun())
         else:
             self._note_begun()
 
-    async def _look_until_begun(self) -> None:
-        while left := self.driver.begins_for():  # noqa: ASYNC110 - a driver reports no event
-            await asyncio.sleep(min(left, LOOK_BEGUN))
+    async def _poll_until_begun(self) -> None:
+        while left := self.driver.begins_for():  # noqa: ASYNC110 - drivers have no event for it
+            await asyncio.sleep(min(left, BEGUN_POLL_S))
         self._note_begun()
 
     def _note_begun(self) -> None:
-        """The device has begun for all holders that are at its driver: from now on their time runs."""
-        now, late = self.mesh.now(), self._waits_said & self._entered
+        """The device has begun for all holders at the driver: start their time."""
+        now, late = self.mesh.now(), self._published_waits & self._entered
         for grant in self._entered & self.holds.held.keys():
             self.holds.begun(grant, now, late=grant in late)
-        self._waits_said -= late
+        self._published_waits -= late
         if self._waits_timer is not None and all(entry.begun for entry in self.holds.held.values()):
             self._waits_timer.cancel()
             self._waits_timer = None
@@ -634,13 +636,13 @@ class ResourceController:
             self.publish()
         self._set_alarm()
 
-    def _say_waits(self) -> None:
+    def _publish_waits(self) -> None:
         self._waits_timer = None
-        if self._waits().keys() - self._waits_said:
+        if self._waits().keys() - self._published_waits:
             self.publish()
 
     def _waits(self) -> dict[Grant, Ns]:
-        """For how long its device has not begun for a holder, at most."""
+        """The longest time until the device has begun, by grant, for holders that wait for it."""
         waits: dict[Grant, Ns] = {}
         now, bound = self.mesh.now(), round(self.begin_within * SECOND)
         for grant, entry in self.holds.held.items():
@@ -654,13 +656,14 @@ class ResourceController:
         return waits
 
     async def _make_safe(self) -> None:
-        """Makes the device safe. Where that takes its time, it goes on beside what comes next, which it holds back."""
+        """Make the device safe. If that takes longer than SAFE_WAIT_S, it runs beside other work, and new holds are
+        held back."""
         if self._making_safe is not None:
             self._safe_again = True
             return
         self._safe_by = self.mesh.now() + self._settle
         self._making_safe = self.supervisor.spawn(self._make_safe_in_time())
-        await asyncio.wait({self._making_safe}, timeout=AT_ONCE)
+        await asyncio.wait({self._making_safe}, timeout=SAFE_WAIT_S)
         if self._making_safe.done():
             self._making_safe = None
         else:
@@ -669,7 +672,7 @@ class ResourceController:
     def _on_safe(self, _task: asyncio.Task[None]) -> None:
         self._making_safe = None
         again, self._safe_again = self._safe_again, False
-        # What it held back begins.
+        # This change lets the held back holds begin.
         self.queue.put_change(HoldChange(settled=again))
 
     async def _make_safe_in_time(self) -> None:
@@ -683,7 +686,7 @@ class ResourceController:
         try:
             await action
         except Exception as error:
-            log.exception("%s: its driver failed; unless that recovers by itself, start its node anew", self.name)
+            log.exception("%s: its driver failed; if it does not recover by itself, restart its node", self.name)
             self.fail(f"its driver failed: {error}")
 
     def _apply(self, change: HoldChange) -> None:
@@ -693,7 +696,7 @@ class ResourceController:
             continued = {grant: former.grant for grant, former in change.continued.items()}
             self._tolerance.changed(self.holds.held.keys(), continued, self.mesh.now())
         if change or change.settled:
-            self._waits_said -= {holder.grant for holder in change.removed}
+            self._published_waits -= {holder.grant for holder in change.removed}
             for holder in change.removed:
                 self._use.hold_ended(holder.grant, self.mesh.now())
             for holder in change.began:
@@ -701,7 +704,7 @@ class ResourceController:
             if change.began and change.interrupts:
                 self._warm_at = self.mesh.now() + round(self.driver.activation * SECOND)
             if change.began and self._waits_timer is None:
-                self._waits_timer = self.supervisor.call_later(SAYS_WAITS, self._say_waits)
+                self._waits_timer = self.supervisor.call_later(WAITS_DELAY_S, self._publish_waits)
             self.queue.put_change(change)
             self.queue.resume(lambda query: query.message.grant in self.holds.held)
         self._missed |= change.reread
@@ -711,7 +714,7 @@ class ResourceController:
         self._lost_by_now()
 
     def _read_state(self) -> asyncio.Task[None]:
-        """Reads `rcm/state`; while that is under way it is the same reading for all who need one."""
+        """Read `rcm/state`, or return the task that is already reading it."""
         if self._reading is None or self._reading.done():
             self._reading = self.supervisor.spawn(self._read())
         return self._reading
@@ -720,7 +723,7 @@ class ResourceController:
         for _ in range(REREADS):
             key, ask = self.mesh.keys.rcm_state, messages.StateAsk(holds_only=True)
             replies = await self.mesh.ask(key, ask, messages.RcmState, timeout=REREAD_TIMEOUT, enough=self._is_current)
-            # One absurd answer must not hide the true one.
+            # An absurd answer must not hide a true one.
             answers = (reply.message for reply in replies if reply.message is not None)
             states = [state for state in answers if self.holds.believes(state.term, self.mesh.now())]
             if not states:
@@ -728,7 +731,7 @@ class ResourceController:
             newest = max(states, key=lambda state: (state.term, state.seq))
             overtaken = (newest.term, newest.seq) < (self.holds.term, self.holds.seq)
             change = self.holds.apply_snapshot(newest, self.mesh.now(), self._carries)
-            # What was published while the answer was on its way may have hidden the very gap it was for.
+            # A publication that overtook the answer may have hidden the gap for which the state was read.
             if not overtaken:
                 self._trace("read")
                 self._missed = False
@@ -743,14 +746,14 @@ class ResourceController:
                 query.refuse(problem)
 
     def _carries(self, holders: Collection[messages.Holder]) -> bool:
-        proposed = [messages.ProposedHolder(one.id, one.arc, one.client, one.params) for one in holders]
+        proposed = [messages.ProposedHolder(held.id, held.arc, held.client, held.params) for held in holders]
         try:
             return self.driver.sharable and not self.driver.vote(proposed)
         except ValueError:
             return False
 
     def _is_current(self, reply: Reply[messages.RcmState]) -> bool:
-        """Whether no other answer is needed: this one is of an RCM that is obeyed already."""
+        """Return True if this answer is from the obeyed RCM, so that no other answer is needed."""
         state, holds = reply.message, self.holds
         return state is not None and state.term == holds.term and state.seq >= holds.seq
 
@@ -763,12 +766,12 @@ class ResourceController:
     def _set_alarm(self) -> None:
         ends, now = (self.holds.next_expiry(), self._tolerance.lost_at), self.mesh.now()
         at = min((end for end in ends if end is not None), default=None)
-        self._alarm.set(at if at is None or at > now else now + round(MIN_DELAY * SECOND))
+        self._alarm.set(at if at is None or at > now else now + round(MIN_EXPIRY_DELAY_S * SECOND))
 
     def _expire(self) -> None:
         if self._lost_by_now():
             return
-        # After a stall of our own, what the RCM published meanwhile may wait in the inbox: it goes first.
+        # After a stall of this process, publications of the RCM may still wait in the inbox: leases must not end now.
         change = self.holds.expire(self.mesh.now(), lease=not self.stall.fresh())
         if change:
             self._trace("end")
@@ -778,36 +781,36 @@ class ResourceController:
         while True:
             published = self._figures()
             await asyncio.sleep(FIGURES_PERIOD)
-            silent = self.mesh.now() - self._published > SAY_AGAIN * SECOND
-            # How much a hold that stands was used grows all the time: that is said with what is said anyway.
+            silent = self.mesh.now() - self._published > REPUBLISH_PERIOD_S * SECOND
+            # The time used grows steadily, so it alone causes no publication.
             if self._figures() != published or self._use.unpublished or silent:
                 self.publish()
 
-    async def _keep_looking(self) -> None:
+    async def _keep_checking(self) -> None:
         while True:
-            await asyncio.sleep(LOOK_PERIOD)
-            await self._look_for_contradictions()
+            await asyncio.sleep(CHECK_PERIOD_S)
+            await self._check_for_contradictions()
 
-    async def _look_for_contradictions(self) -> None:
-        """A leader that is seen and not heard, or heard and not seen, or heard and asks nothing: what is declared here,
-        or there, is not known to the other. Where candidates are seen, one leads before long."""
-        silent = bool(self._leaders) and not self._hears
+    async def _check_for_contradictions(self) -> None:
+        """Suspect the mesh if a leader's token, its publications or its queries are missing while another of them
+        arrives: then declarations did not reach the other side. Also if candidates are seen and none leads in time."""
+        silent = bool(self._leaders) and not self._receives
         self.mesh.suspicions.suspect(f"{self.name}: an RCM is seen that does not publish", so=silent, patience=UNHEARD)
         signs = {
-            f"{self.name}: the RCM publishes and is not seen": self._hears and not self._leaders,
-            f"{self.name}: the RCM publishes and has not asked for its promise": self._hears
+            f"{self.name}: the RCM publishes and is not seen": self._receives and not self._leaders,
+            f"{self.name}: the RCM publishes and has not asked for its promise": self._receives
             and self.instances.state is not InstanceState.STANDS_BY
             and self._asked != self.holds.term,
         }
         for sign, seen in signs.items():
             self.mesh.suspicions.suspect(sign, so=seen)
         candidates = self.mesh.keys.alive_any(Role.CANDIDATE)
-        missed = not (self._leaders or self._hears) and await self.mesh.living(candidates, timeout=REREAD_TIMEOUT)
+        missed = not (self._leaders or self._receives) and await self.mesh.living(candidates, timeout=REREAD_TIMEOUT)
         self.mesh.suspicions.suspect(
             f"{self.name}: candidates are seen, and no RCM", so=bool(missed), patience=LEADERLESS
         )
 
     @property
-    def _hears(self) -> bool:
-        # Half a hold lease is longer than a heartbeat, and leaves a successor time before holds end.
-        return self._heard is not None and self.mesh.now() - self._heard < self.holds.hold_lease // 2
+    def _receives(self) -> bool:
+        # Half a hold lease is longer than a heartbeat, and leaves time for a new leader before holds end.
+        return self._last_published is not None and self.mesh.now() - self._last_published < self.holds.hold_lease // 2
