@@ -65,7 +65,7 @@ def test_no_key_is_without_a_rule() -> None:
 
 
 def test_every_row_of_the_protocols_table_has_its_rule_and_no_other() -> None:
-    document = (ROOT / "docs" / "protocol.md").read_text()
+    document = (ROOT / "docs" / "protocol" / "keys.md").read_text()
     table = set(re.findall(r"^\| `zscout/<fleet>/([^`]*)` \|", document, re.MULTILINE))
     places = {"<kind>/<name>": "{rc}", "<host>": "*", "<client>": "*", "<role>": "*", "<instance>": "*"}
     told = set()

@@ -1,4 +1,4 @@
-"""The key table of docs/protocol.md: it says what is sent where, and so what is fuzzed."""
+"""The key table of docs/protocol/keys.md: it says what is sent where, and so what is fuzzed."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Final
 
 from zscout import messages
 
-PROTOCOL: Final = Path(__file__).parents[2] / "docs" / "protocol.md"
+PROTOCOL: Final = Path(__file__).parents[2] / "docs" / "protocol" / "keys.md"
 _CHUNK: Final = re.compile(r"<(\w+)>")
 
 

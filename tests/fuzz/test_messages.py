@@ -136,7 +136,7 @@ def test_every_key_of_the_key_space_has_a_row() -> None:
     assert len(built) > 25
     rows = [f"zscout/zscout/{row.expression}" for row in ROWS] + ["zscout/zscout/alive/*/rc/*/*/*"]
     without = {name: key for name, key in built.items() if not any(intersects(key, row) for row in rows)}
-    assert not without, "no row of the key table in docs/protocol.md"
+    assert not without, "no row of the key table in docs/protocol/keys.md"
 
 
 def test_a_row_that_does_not_say_what_crosses_there_is_refused() -> None:

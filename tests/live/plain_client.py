@@ -27,7 +27,7 @@ import time
 from dataclasses import dataclass, field
 from typing import Any
 
-# Protocol, "Joining": with few receiving threads one cut-off host stalls every link.
+# docs/protocol/joining.md: with few receiving threads one cut-off host stalls every link.
 os.environ.setdefault("ZENOH_RUNTIME", "(rx:(worker_threads:16),net:(worker_threads:4),tx:(worker_threads:4))")
 
 import zenoh
@@ -83,7 +83,7 @@ def absurd(term: tuple[int, str], known: tuple[int, str]) -> bool:
 
 
 def matches(pattern: str, rc: str) -> bool:
-    """Protocol, "Names and keys": Zenoh's own rules, without the number behind the pattern."""
+    """docs/protocol/keys.md: Zenoh's own rules, without the number behind the pattern."""
     return bool(zenoh.KeyExpr(pattern.partition("#")[0]).includes(zenoh.KeyExpr(rc)))
 
 
@@ -128,7 +128,7 @@ class PlainClient:
         self.over = threading.Event()
 
     def declare(self) -> list[Any]:
-        """Protocol, "A client": first what hears, then the token that says so."""
+        """docs/protocol/client.md: first what hears, then the token that says so."""
         me = f"{self.base}/client/{self.host}/{self.name}"
         subscriber = self.session.liveliness().declare_subscriber
         token = f"{self.base}/alive/{self.host}/client/{self.name}/{secrets.token_hex(6)}"

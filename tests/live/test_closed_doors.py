@@ -19,6 +19,7 @@ import zenoh
 from tests.hang import HANG
 from tests.live.closed import DAY, ClosedLab, make_authority, raw_session
 from tests.mesh.kit import until
+from tests.protocol_pages import read_page
 from zscout.config.certificate_authority import CertificateAuthority
 from zscout.config.certificates import read_certificates
 from zscout.keyexpr import ACCESS, Keys, Sender
@@ -27,7 +28,7 @@ from zscout.mesh.zenoh_mesh import Security, zenoh_config
 
 pytestmark = pytest.mark.live
 
-DOCUMENT: Final = (Path(__file__).parents[2] / "docs" / "protocol.md").read_text()
+DOCUMENT: Final = read_page("access")
 
 
 def tls(folder: Path, *, own: bool = True) -> dict[str, Any]:
@@ -164,9 +165,8 @@ CLASSES: Final = {
 
 def rows() -> list[tuple[str, dict[str, set[str]]]]:
     """The table of the protocol: each key, and which ranks may do what."""
-    section = DOCUMENT[DOCUMENT.index("## Who may send what") :]
     found = []
-    for line in section.splitlines():
+    for line in DOCUMENT.splitlines():
         if match := re.match(r"\| `([^`]+)` \|(.*)\|$", line):
             cells = [cell.strip() for cell in match[2].split("|")]
             found.append((match[1], {act: CLASSES[cell] for act, cell in zip(ACTS, cells, strict=True)}))

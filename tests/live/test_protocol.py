@@ -1,5 +1,5 @@
-"""`docs/protocol.md` is complete: it names all that crosses the mesh, its examples are what the code takes,
-and a client written from it alone lives through everything that may happen to a client."""
+"""The pages of `docs/protocol.md` are complete: they name all that crosses the mesh, the code takes their examples,
+and a client written from them alone survives everything that may happen to a client."""
 
 from __future__ import annotations
 
@@ -19,25 +19,25 @@ import pytest
 import zscout
 from tests.hang import HANG
 from tests.live.lab import Lab
+from tests.protocol_pages import read_page
 from zscout import messages
 from zscout.behaviors.client.arc import hold
 from zscout.keyexpr import Keys, Role, Sender
 from zscout.messages import RcmState
 from zscout.types import SECOND
 
-DOCUMENT = (Path(__file__).parents[2] / "docs" / "protocol.md").read_text()
 STRUCTS: dict[str, Any] = {
     name: kind
     for name, kind in inspect.getmembers(messages, inspect.isclass)
     if issubclass(kind, messages.Message) and kind is not messages.Message
 }
-EXAMPLES = re.findall(r"`zscout\.(\w+)\.v1`[^\n]*\n\n```json\n(.*?)\n```", DOCUMENT, re.DOTALL)
+EXAMPLES = re.findall(r"`zscout\.(\w+)\.v1`[^\n]*\n\n```json\n(.*?)\n```", read_page("example"), re.DOTALL)
 
 
 @pytest.mark.parametrize("name", STRUCTS)
 def test_the_document_names_every_message_and_field(name: str) -> None:
-    section = re.search(rf"^### {name}\b.*?(?=^##)", DOCUMENT, re.DOTALL | re.MULTILINE)
-    assert section is not None, f"docs/protocol.md has no section on {name}"
+    section = re.search(rf"^### {name}\b.*?(?=^##|\Z)", read_page("messages"), re.DOTALL | re.MULTILINE)
+    assert section is not None, f"docs/protocol/messages.md has no section on {name}"
     told = set(re.findall(r"^\| `(\w+)` \|", section.group(), re.MULTILINE))
     tag = STRUCTS[name].__struct_config__.tag_field
     fields = {field.encode_name for field in msgspec.structs.fields(STRUCTS[name])} | ({tag} if tag else set())
@@ -49,13 +49,14 @@ def test_the_document_names_every_error_code_and_outcome() -> None:
     raised = r"(?:Refused|Refusal|Problem)\(\s*\"(\w+)\""
     codes = {code for source in sources for code in re.findall(raised, source)} - {"unknown"}
     assert len(codes) > 15
-    table = set(re.findall(r"^\| `(\w+)` \|", DOCUMENT[DOCUMENT.index("## Errors") :], re.MULTILINE))
-    assert codes <= table, f"not in the document: {sorted(codes - table)}"
+    table = set(re.findall(r"^\| `(\w+)` \|", read_page("errors"), re.MULTILINE))
+    assert codes <= table, f"not in docs/protocol/errors.md: {sorted(codes - table)}"
 
 
 def test_the_document_names_every_key_and_role() -> None:
     keys, sender = Keys("fleet"), Sender("H", "C")
     both = keys, Keys("fleet", closed=True)
+    page = read_page("keys")
     built = [
         keys.schedule(sender),
         keys.grants,
@@ -71,9 +72,9 @@ def test_the_document_names_every_key_and_role() -> None:
     words = {"fleet": "<fleet>", "H": "<host>", "C": "<client>", "K": "<kind>", "N": "<name>"}
     for key in built:
         told = "/".join(words.get(chunk, chunk) for chunk in key.split("/"))
-        assert f"| `{told}` |" in DOCUMENT
+        assert f"| `{told}` |" in page
     roles = {value for name, value in vars(Role).items() if name.isupper()}
-    tokens = DOCUMENT[DOCUMENT.index("### Tokens") : DOCUMENT.index("## Order")]
+    tokens = page[page.index("## Tokens") :]
     assert roles == set(re.findall(r"^\| `(\w+)` \|", tokens, re.MULTILINE)) - {"role"}
 
 

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import itertools
 import re
-from pathlib import Path
 
 import pytest
 
+from tests.protocol_pages import read_page
 from zscout.scheduling.model import TRANSITIONS, Arc, ArcRequest, ArcState
 from zscout.scheduling.reason import Party, Reason, ReasonCode
 from zscout.types import NO_TERM, SECOND, Place
 
-PROTOCOL = (Path(__file__).parents[2] / "docs" / "protocol.md").read_text()
+PROTOCOL = read_page("messages")
 
 
 def arc_in(state: ArcState) -> Arc:
