@@ -105,7 +105,7 @@ def test_trees_have_bounds() -> None:
         root.add(Count("more"))
     twice = All("n")
     twice.add(Count("a"))
-    with pytest.raises(ValueError, match="a already"):
+    with pytest.raises(ValueError, match="already has a behavior a"):
         twice.add(Count("a"))
     with pytest.raises(ValueError, match="not valid"):
         Count("a/b")

@@ -291,16 +291,16 @@ async def test_who_handed_over_takes_back_what_the_new_one_does_not_take_on(lab:
     failed = await Target.there(lab.fleet_of("b"), 3)
     failed.answer = lambda request: request.answer(failed.view("ended", "failed"))
     failed.at_last = failed.gives_back
-    assert "asked anew here" in await fails(failed)
+    assert "submitted again here" in await fails(failed)
     unknown = await Target.there(lab.fleet_of("b"), 4)
     unknown.answer = lambda request: request.refuse(Problem("unknown_component", "what?"))
     unknown.at_last = unknown.gives_back
-    assert "asked anew here" in await fails(unknown)
+    assert "submitted again here" in await fails(unknown)
     # This one dies with all that it holds, and says nothing.
     silent = await Target.there(lab.fleet_of("b"), 5)
     silent.answer = lambda _: silent.token.close()
     silent.at_last = silent.leave
-    assert "asked anew here" in await fails(silent)
+    assert "submitted again here" in await fails(silent)
     assert sorted(set(grants)) == grants[1:]
 
 

@@ -1,9 +1,9 @@
-"""Becomes another command that ends with its parent: run as a program.
+"""Execute a command that ends with its parent process; run this file as a program.
 
     python -I -S launch.py PARENT COMMAND [ARG]...
 
-Asks the kernel to end it when its parent (PARENT, a pid) dies, then executes COMMAND. It imports nothing of zscout.
-What holds devices has a guardian instead (`guardian.py`): its children must end as well.
+It asks the kernel for SIGTERM when its parent (PARENT, a pid) dies, then executes COMMAND. It imports nothing of
+zscout. Commands that hold devices have a guardian instead (`guardian.py`), which ends their children as well.
 """
 
 import ctypes
@@ -14,11 +14,11 @@ import sys
 PR_SET_PDEATHSIG = 1
 NOT_EXECUTABLE, NOT_FOUND = 126, 127
 LAUNCH = (sys.executable, "-I", "-S", __file__)
-"""What stands before PARENT."""
+"""Command line up to PARENT."""
 
 
 def main() -> None:
-    # What Python changed at its start must not be inherited.
+    # The command must not inherit the signal handlers that Python has set.
     signal.signal(signal.SIGPIPE, signal.SIG_DFL)
     signal.signal(signal.SIGXFSZ, signal.SIG_DFL)
     if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
@@ -28,7 +28,7 @@ def main() -> None:
     if os.getppid() != parent:
         sys.exit(128 + signal.SIGTERM)
     try:
-        os.execvp(command[0], command)  # noqa: S606 - this is what it is for
+        os.execvp(command[0], command)  # noqa: S606 - the purpose of this program
     except OSError as error:
         sys.stderr.write(f"zscout: {command[0]} can't be run: {error.strerror}; check the path\n")
         sys.exit(NOT_FOUND if isinstance(error, FileNotFoundError) else NOT_EXECUTABLE)

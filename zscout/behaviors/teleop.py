@@ -1,8 +1,11 @@
-"""A robot in an operator's hands: taken at operator priority, driven as a `Pilot` says, given back.
+"""Teleoperation: an operator takes a robot, drives it by a `Pilot`, and gives it back.
 
 teleop = Teleop(client, RobotNeeds("robot/scout33"), Pilot(), priority=10)
 running = asyncio.create_task(teleop.run())
-teleop.take()                       # and give_back(); press keys at teleop.pilot, then teleop.wake()
+teleop.take()
+teleop.pilot.press(now, "forward")
+teleop.wake()
+teleop.give_back()
 """
 
 from __future__ import annotations
@@ -22,32 +25,32 @@ from zscout.messages import ReasonInfo
 from zscout.types import SECOND, Ns
 
 PERIOD: Final = 0.05
-"""Seconds between two looks at the pilot."""
+"""Seconds between two readings of the pilot."""
 LONGEST: Final = 0.6
-"""Seconds that one command drives at most: a robot whose operator is cut off stops after that."""
+"""Most seconds that one command drives: the robot stops after that if its operator is cut off."""
 RETRY_AFTER: Final = 1.0
-"""Seconds before the robot is asked for again after a refusal."""
+"""Seconds after a refusal until the robot is requested again."""
 
 AT_LEAST: Final = 1.0
-"""Seconds before another operator may take over."""
+"""Minimum runtime of the hold, in seconds: another operator can't take over sooner."""
 
 ASKS_AGAIN: Final = frozenset({"preempted", "lost"})
-"""Ends of a hold after which the robot is still wanted; others mean that somebody ended it on purpose."""
+"""Outcomes of a hold after which the robot is requested again; after others, which are deliberate, it is not."""
 FIRST: Final = 0.6
 """Seconds that one press of a key drives."""
 NEXT: Final = 0.25
-"""Seconds that each repetition does."""
+"""Seconds that each repetition of a pressed key drives."""
 REPEATS: Final = 0.55
-"""Seconds within which the same key again is a repetition."""
+"""Most seconds between two presses of a key that count as repetition."""
 STICK_TIMEOUT: Final = 1.0
-"""Seconds that a stick counts without a report."""
+"""Seconds for which a stick's last report counts."""
 TURN: Final = 0.5
-"""Share of the speed at which the robot turns on the spot: a full turn would be too quick to aim."""
+"""Share of the speed at which the robot turns on the spot: at full speed it would be hard to aim."""
 DEAD_ZONE: Final = 0.08
-"""Of a stick: it never rests at exactly 0."""
+"""Positions of a stick that count as 0: it never rests exactly there."""
 SLOWEST: Final = 0.1
 NOTCH: Final = 0.1
-"""What one press of + or - changes."""
+"""Change of the speed per press of + or -."""
 
 State: TypeAlias = Literal["free", "waiting", "driving"]
 Way: TypeAlias = Literal["forward", "back", "left", "right"]
@@ -61,7 +64,7 @@ WHEELS: Final[dict[Way, tuple[float, float]]] = {
 
 @dataclass(frozen=True, slots=True)
 class Wheels:
-    """What the robot is to do: -1 to 1 of top speed, for `lasts` seconds at most."""
+    """Speeds of the wheels, -1 to 1 of top speed, for at most `lasts` seconds."""
 
     left: float
     right: float
@@ -76,12 +79,12 @@ STOP: Final = Wheels(0.0, 0.0, 0.0)
 
 
 class Pilot:
-    """From keys and sticks to wheels: what the operator wants at any moment. Pure; time is passed in.
+    """Translates keys and sticks to speeds of the wheels. Pure; time is passed in, in seconds.
 
-    A terminal reports no releases: a key that is held down comes again and again, first after a delay of a quarter to
-    half a second, then some 30 times a second. So a press drives for FIRST seconds, which bridges the delay, a
-    repetition for NEXT, and a released key stops the robot by itself soon after. A stick reports its position; that
-    counts until it reports otherwise, and a pad without reports counts as released after STICK_TIMEOUT.
+    A terminal reports no releases: a key held down is repeated, first after a delay of a quarter to half a second, then
+    some 30 times a second. So a press drives for FIRST seconds, which bridges the delay, each repetition for NEXT, and
+    the robot stops soon after the key is released. A stick's position counts until its next report, at most for
+    STICK_TIMEOUT.
     """
 
     def __init__(self, speed: float = 0.6) -> None:
@@ -90,37 +93,37 @@ class Pilot:
             raise ValueError(f"speed {speed:g} is not above 0 and at most 1")
         self.speed = speed
         self._ways: dict[Way, tuple[float, float]] = {}
-        """By way that is being driven: when its key came last, and until when that drives."""
+        """By direction: time of the key's last press, and the time until which it drives."""
         self._stick: tuple[float, float, float] | None = None
-        """When it was last reported, forward, to the right."""
+        """Last report of a stick: time, forward, right."""
 
     def press(self, now: float, way: Way) -> None:
-        """A key that drives, pressed or repeated."""
+        """Take a press or repetition of a key that drives."""
         came, drives_until = self._ways.get(way, (-math.inf, now))
-        # A repetition never cuts short what the press gave.
+        # A repetition never shortens the time of the press.
         self._ways[way] = (now, max(drives_until, now + (NEXT if now - came <= REPEATS else FIRST)))
         opposite: dict[Way, Way] = {"forward": "back", "back": "forward", "left": "right", "right": "left"}
         self._ways.pop(opposite[way], None)
 
     def stick(self, now: float, forward: float, right: float) -> None:
-        """A pad's stick, -1 to 1 each; what is not a number counts as let go."""
+        """Take a stick's position, each axis -1 to 1; NaN counts as released."""
         values = [value if abs(value) >= DEAD_ZONE else 0.0 for value in (forward, right)]
         self._stick = (now, *(max(-1.0, min(1.0, value)) for value in values))  # type: ignore[assignment]
 
     def stop(self) -> None:
-        """At once, whatever was asked before."""
+        """Stop at once; forget all keys and the stick."""
         self._ways.clear()
         self._stick = None
 
     def faster(self, notches: int) -> None:
-        """By so many notches; negative is slower."""
+        """Change the speed by `notches`; negative is slower."""
         self.speed = round(max(SLOWEST, min(1.0, self.speed + notches * NOTCH)), 2)
 
     def wheels(self, now: float) -> Wheels:
-        """What is wanted now; ask often."""
+        """Return the speeds wanted at `now`; call it often."""
         self._ways = {way: times for way, times in self._ways.items() if now < times[1]}
         if self._ways:
-            # Two keys at once drive a curve.
+            # Two keys together drive a curve.
             left = sum(WHEELS[way][0] for way in self._ways)
             right = sum(WHEELS[way][1] for way in self._ways)
             lasts = max(until for _, until in self._ways.values()) - now
@@ -130,13 +133,13 @@ class Pilot:
             if lasts <= 0 or not (forward or across):
                 return STOP
             left, right = forward + TURN * across, forward - TURN * across
-        # Neither wheel turns faster than was asked for.
+        # Neither wheel exceeds `speed`.
         most = max(1.0, abs(left), abs(right))
         return Wheels(self.speed * left / most, self.speed * right / most, lasts)
 
 
 class Teleop:
-    """One operator's hold of one robot."""
+    """Takes, drives and gives back one robot for one operator."""
 
     def __init__(
         self,
@@ -147,17 +150,17 @@ class Teleop:
         priority: int,
         changed: Callable[[], None] = lambda: None,
     ) -> None:
-        """`changed` is called at each new `state` or `why`."""
+        """`changed` is called when `state`, `why` or `takeover` changes."""
         self.client, self.needs, self.pilot, self.priority = client, needs, pilot, priority
         self.state: State = "free"
         self.why = ""
+        """For people: the reason to wait, or why the robot was lost."""
         self.reason: ReasonInfo | None = None
-        """What `why` says, as data, where it is the leader's reason to wait."""
-        """In words: for what it waits, or why it was lost."""
+        """The leader's reason to wait, in structured form, if `why` has its text."""
         self.robot: HeldRobot | None = None
         self.held: Held | None = None
         self.takeover: float | None = None
-        """Seconds from the last `take` to the first drive that the robot's RC obeyed."""
+        """Seconds from the last `take` to the first drive command that the robot's RC accepted."""
         self._changed = changed
         self._wanted, self._unwanted = asyncio.Event(), asyncio.Event()
         self._wake = asyncio.Event()
@@ -165,7 +168,7 @@ class Teleop:
         self._name = f"operator-{needs.robot.partition('/')[2]}"
 
     def take(self) -> None:
-        """The robot is wanted from now on."""
+        """Request the robot, and keep requesting it until `give_back`."""
         if not self._wanted.is_set():
             self._asked_at, self.takeover = self.client.mesh.now(), None
             self._wanted.set()
@@ -173,18 +176,18 @@ class Teleop:
         self.wake()
 
     def give_back(self) -> None:
-        """It is not wanted any more: who was preempted goes on."""
+        """Give the robot back; a preempted holder gets it again."""
         self.pilot.stop()
         self._wanted.clear()
         self._unwanted.set()
         self.wake()
 
     def wake(self) -> None:
-        """The pilot has something new."""
+        """Read the pilot at once, without waiting for PERIOD."""
         self._wake.set()
 
     async def run(self) -> None:
-        """Takes, drives and gives back, until it is cancelled. Then the robot is given back, too."""
+        """Take, drive and give back the robot on request, until cancelled, which also gives it back."""
         self.client.internals.watch(self._on_notice)
         while True:
             await self._wanted.wait()
@@ -193,10 +196,10 @@ class Teleop:
             try:
                 await self._while_wanted(self._drive())
                 if self._wanted.is_set():
-                    # To ask again would take it back from an operator of the same rank, and so on in turns.
+                    # To request it again would preempt another operator of the same rank, and so on in turns.
                     ending = self.held.arc._ending if self.held is not None else None
                     successor = (ending.by or ending.reason) if ending is not None else ""
-                    why = f"it was taken by {successor or 'another'}"
+                    why = f"it was taken by {successor or 'another request'}"
                     self.give_back()
             except Revoked as revoked:
                 self._set_state("waiting", f"it was taken away: {revoked}")
@@ -216,7 +219,7 @@ class Teleop:
             self._set_state("waiting", arc.reason, arc.why)
 
     async def _while_wanted(self, work: Coroutine[Any, Any, None]) -> None:
-        """Does `work`, and ends it when the robot is not wanted any more."""
+        """Do `work`; cancel it when the robot is given back."""
         tasks = [asyncio.create_task(work), asyncio.create_task(self._unwanted.wait())]
         try:
             await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
@@ -228,14 +231,14 @@ class Teleop:
             raise results[0]
 
     async def _drive(self) -> None:
-        # A camera that is to come is waited for.
+        # Wait for a camera that has not joined yet.
         how: dict[str, Any] = {"priority": self.priority, "min_runtime": AT_LEAST, "wait_for_device": True}
         async with hold(self.client, self._name, self.needs.needs(), **how) as held:
             robot = self.robot = HeldRobot(held, self.needs)
             self.held = held
             self._set_state("driving", "")
             while True:
-                # The wheels go first: whoever takes over in a hurry does not wait for the camera.
+                # The wheels before the camera: an operator in a hurry must not wait for it.
                 await self._steer(robot)
                 await robot.camera(True)
                 await done_within(PERIOD, self._wake.wait())

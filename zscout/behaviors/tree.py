@@ -1,4 +1,4 @@
-"""Behaviors that form a tree: their names, their status, and what outlives a move.
+"""Trees of behaviors: their names, status and memory, which survives a move.
 
     class Greet(Behavior):
         async def run(self, context):
@@ -9,8 +9,8 @@
     root.add(Greet("door"))           # its path is hall/door
     await root.perform(context)
 
-A behavior performs its children as it likes. The status that any of them reports is published under its
-path, so that people see the tree; the memory of each is checkpointed with the whole tree.
+Each behavior decides when to perform its children. The status that a behavior reports is published under its path, so
+that people see the tree; the memory of each is checkpointed with the whole tree.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from zscout.types import SECOND, Ns
 MAX_DEPTH: Final = 8
 MAX_CHILDREN: Final = 64
 MAX_RATE: Final = 20
-"""Publications of one client in a second; alerts and ends are always published."""
+"""Most publications of a client per second; alerts and ends are always published."""
 REPUBLISH_EVERY: Final = 5.0
 """Seconds after which the status of every behavior that has not ended is published again."""
 MAX_PATH: Final = 200
@@ -40,38 +40,38 @@ MAX_WORD: Final = 64
 
 @dataclass(frozen=True, slots=True)
 class BehaviorContext:
-    """What a tree of behaviors runs on."""
+    """The surroundings of a tree of behaviors."""
 
     client: Client
     safe_point: Callable[[], Awaitable[None]]
-    """Await it wherever the state of the whole tree is sound: the tree may be moved to another host."""
+    """Await it wherever the state of the whole tree is consistent: the tree may then move to another host."""
     publish: Callable[[BehaviorSaid], None]
     speed: float = 1.0
-    """How many seconds of the robots' world pass in one of ours: 1, but for a simulated one."""
+    """Seconds of the robots' world per real second: 1, except in a simulation."""
     name: str = ""
-    """Of the component that the tree runs as, if it is one."""
+    """Name of the component that runs the tree, if any."""
 
 
 class Behavior:
-    """A node of the tree. Subclasses write `run`, and with `memory` and `recall` what outlives a move."""
+    """A node of the tree. Subclasses define `run`, and `memory` and `recall` for state that survives a move."""
 
     def __init__(self, name: str) -> None:
-        """Raises BadName for what can't stand in a path."""
+        """Raises BadName if `name` can't be part of a path."""
         self.name = check_name(name, "behavior")
         self.parent: Behavior | None = None
         self.above = ""
-        """Of a root: the path of its parent, which lives in another process."""
+        """For a root: path of its parent in another process."""
         self.children: list[Behavior] = []
         self.doing = ""
         self.detail = ""
         self._publish_status: Callable[[BehaviorSaid], None] | None = None
 
     def add(self, child: Behavior) -> None:
-        """Puts `child` under this one. Raises ValueError for a name that is there, or a tree too large."""
+        """Add a child. Raises ValueError for a duplicate name, or a tree too large."""
         if any(other.name == child.name for other in self.children):
-            raise ValueError(f"{self.path} has a behavior {child.name} already")
+            raise ValueError(f"{self.path} already has a behavior {child.name}")
         if len(self.children) >= MAX_CHILDREN or self.depth >= MAX_DEPTH:
-            raise ValueError(f"{self.path} may have {MAX_CHILDREN} behaviors, {MAX_DEPTH} deep")
+            raise ValueError(f"{self.path} may have at most {MAX_CHILDREN} behaviors, {MAX_DEPTH} levels deep")
         child.parent = self
         self.children.append(child)
 
@@ -85,11 +85,11 @@ class Behavior:
         return f"{above}/{self.name}" if above else self.name
 
     async def run(self, context: BehaviorContext) -> None:
-        """Does its work. To raise is to fail; cancelled when it is to end."""
+        """Do the work until cancelled; any error fails the behavior."""
         raise NotImplementedError(f"{type(self).__name__} has no run(); write one")
 
     async def perform(self, context: BehaviorContext) -> None:
-        """`run`, with its status published: call this for a child, and for the root."""
+        """Run the behavior and publish its status. Call this, not `run`, for children and the root."""
         self._publish_status = context.publish
         try:
             await self.run(context)
@@ -106,28 +106,28 @@ class Behavior:
         alert: bool = False,
         boxes: Sequence[Box] = (),
     ) -> None:
-        """What it does from now on. The same reported again is published once, but for alerts and boxes."""
+        """Publish a new status. A repeated status is left out, unless it has an alert or a camera."""
         if (doing, detail) == (self.doing, self.detail) and not alert and not camera:
             return
         self.doing, self.detail = doing, detail
         if self._publish_status is not None:
             self._publish_status(BehaviorSaid(self.path, doing, detail, robot, camera, alert, list(boxes)))
 
-    # What outlives a move
+    # State that survives a move
 
     def memory(self) -> dict[str, Any]:
-        """What this one remembers, as JSON can carry it; without its children's."""
+        """Return this behavior's state for JSON, without its children's."""
         return {}
 
     def recall(self, memory: dict[str, Any]) -> None:
-        """Takes in what `memory` gave. Raises ValueError for what it can't use."""
+        """Restore the state that `memory` returned. Raises ValueError if it is invalid."""
 
     def checkpoint(self) -> dict[str, Any]:
-        """The memories of the whole tree."""
+        """Return the memories of the whole tree."""
         return {"own": self.memory(), "children": {child.name: child.checkpoint() for child in self.children}}
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Takes in what `checkpoint` gave. Children that are not there are passed over."""
+        """Restore the state that `checkpoint` returned; state of missing children is ignored."""
         self.recall(state.get("own", {}))
         known = state.get("children", {})
         for child in self.children:
@@ -136,14 +136,14 @@ class Behavior:
 
 
 class CarriedClock:
-    """The seconds that a behavior has lived, carried from host to host, whose own clocks differ."""
+    """Seconds that a behavior has lived, carried along in moves, as the clocks of hosts differ."""
 
     def __init__(self) -> None:
         self.seconds = 0.0
         self._read_at: Ns | None = None
 
     def read(self, at: Ns, speed: float = 1.0) -> float:
-        """The seconds lived until `at` by this host's clock, since the last reading at `speed`."""
+        """Return the seconds lived until `at` on this host's clock; time since the last reading counts `speed`-fold."""
         if self._read_at is not None:
             self.seconds += (at - self._read_at) / SECOND * speed
         self._read_at = at
@@ -151,7 +151,7 @@ class CarriedClock:
 
 
 class StatusPublisher:
-    """Publishes the status of a client's behaviors, at a rate that a mesh can bear. Call it with each."""
+    """Publishes the status of a client's behaviors, at most MAX_RATE per second. Call it with each status."""
 
     def __init__(self, client: Client) -> None:
         keys, me, self._now = client.mesh.keys, client.mesh.me, client.mesh.now
@@ -175,13 +175,13 @@ class StatusPublisher:
             self._current.pop(status.path, None)
         now = self._now()
         crowded = len(self._published) == MAX_RATE and now - self._published[0] < SECOND
-        # One that is withheld is published later, if it is still the newest then.
+        # A status withheld now is published by `keep_publishing`, unless a newer one replaces it.
         if not crowded or not status.doing or status.alert:
             self._published.append(now)
             self._publisher.put(status)
 
     async def keep_publishing(self) -> None:
-        """Publishes now and then what each behavior does, for new subscribers."""
+        """Publish the status of each behavior regularly, for new subscribers."""
         while True:
             await asyncio.sleep(REPUBLISH_EVERY)
             for status in list(self._current.values()):

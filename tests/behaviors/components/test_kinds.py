@@ -81,7 +81,7 @@ async def test_who_is_not_wanted_goes_on_and_gives_the_loop_a_turn() -> None:
     gate = SafePointGate()
     turns: list[int] = []
     asyncio.get_running_loop().call_soon(turns.append, 1)
-    await gate.come()
+    await gate.enter()
     assert turns == [1]
     assert not gate.holds
 
@@ -93,7 +93,7 @@ async def test_who_comes_is_held_until_released() -> None:
         nonlocal steps
         while True:
             steps += 1
-            await gate.come()
+            await gate.enter()
 
     running = asyncio.create_task(run())
     for _ in range(3):
@@ -113,12 +113,12 @@ async def test_who_does_not_come_is_not_held_later() -> None:
     gate = SafePointGate()
     assert not await gate.hold(0.01)
     async with asyncio.timeout(HANG):
-        await gate.come()
+        await gate.enter()
 
 
 async def test_who_is_cancelled_at_the_gate_is_not_held_any_more() -> None:
     gate = SafePointGate()
-    comes = asyncio.create_task(gate.come())
+    comes = asyncio.create_task(gate.enter())
     held = [await gate.hold(HANG), gate.holds]
     comes.cancel()
     await asyncio.gather(comes, return_exceptions=True)

@@ -36,7 +36,7 @@ async def carried_out(client: Client) -> None:
     gate = SafePointGate()
     moving = asyncio.ensure_future(OutgoingMove(client, Counter({}), gate, MoveComponent("c", 1, "b", 2)).carry_out())
     while not moving.done():
-        await gate.come()
+        await gate.enter()
         await asyncio.sleep(0.01)
     await moving
 
@@ -106,7 +106,7 @@ async def test_a_successor_counts_as_gone_once_it_was_not_seen_for_longer_than_i
     client = Client(network.open("f", Sender("a", "c.1")), replace(fleet, mesh=replace(fleet.mesh, lease=lease)))
     token = network.open("f", Sender("b", "node")).alive(Token("b", Role.NODE, "node", "i"))
     move = OutgoingMove(client, Counter({}), SafePointGate(), MoveComponent("c", 1, "b", 2))
-    confirming = asyncio.ensure_future(move._confirmed())
+    confirming = asyncio.ensure_future(move._activate_successor())
     await asyncio.sleep(1)
     token.close()
     last_seen = client.mesh.now()

@@ -1,1 +1,1 @@
-"""Components: programs that a node starts, watches, moves and ends. How to write one: `component.py`."""
+"""Components: programs that a node starts, watches, moves and ends; `component.py` has their base class."""

@@ -1,6 +1,6 @@
-"""What a node and a component's process exchange over a socket pair: JSON objects, one in each line.
+"""Messages between a node and the process of a component: JSON objects over a socket pair, one per line.
 
-The node sends orders, the process reports.
+The node sends orders, the process sends reports.
 """
 
 from __future__ import annotations
@@ -17,15 +17,15 @@ from zscout.messages import MAX_MOVE, HowEnded, Problem, StartComponent
 MAX_FRAME: Final = MAX_MOVE + 65_536
 """Bytes."""
 PATIENCE: Final = 5.0
-"""Seconds that a component has to come to a safe point for a checkpoint."""
+"""Seconds that a component has to reach a safe point for a checkpoint."""
 
 
 class BadFrame(Exception):
-    """The other side does not keep to the form; says what came."""
+    """The other side sent a malformed or oversized frame."""
 
 
 class ComponentJob(msgspec.Struct, frozen=True, tag="job"):
-    """The first order: what to run, and as whom."""
+    """The first order: the component to run."""
 
     start: StartComponent
     where: str
@@ -33,9 +33,9 @@ class ComponentJob(msgspec.Struct, frozen=True, tag="job"):
     host: str
     fleet: Fleet
     tag: str
-    """Stands in the environment of this process and of all that it starts."""
+    """Mark in the environment of this process, which its descendants inherit."""
     memory: int = 0
-    """Bytes that each process may allocate; 0: no limit of this sort."""
+    """Bytes that each process may allocate; 0: no such limit."""
 
     @property
     def client(self) -> str:
@@ -52,23 +52,23 @@ Operation: TypeAlias = (
 
 
 class Order(msgspec.Struct, frozen=True, tag="order"):
-    """What the node was asked, as it was asked. Answered with an OrderAnswer of this number; a stop and an
-    activation are not, but reports follow."""
+    """An operation that the node received, unchanged. The process answers with an OrderAnswer of this `number`; a stop
+    and an activation have no answer, only the reports that follow."""
 
     number: int
     operation: Operation
 
 
 class PhaseReport(msgspec.Struct, frozen=True, tag="stands"):
-    """How far the component has come."""
+    """The component has reached this phase."""
 
     phase: Literal["standby", "running"]
     movable: bool
 
 
 class OrderAnswer(msgspec.Struct, frozen=True, tag="answer"):
-    """To the order of this number: the state of a component, or how long (s) a move took it out of work.
-    `problem`: it was not carried out, and the component goes on."""
+    """Answer to the order of this number: the component's `state`, or for how many seconds it was paused by a move
+    (`dead`). With `problem` the order failed, and the component continues."""
 
     number: int
     state: bytes = b""
@@ -77,7 +77,8 @@ class OrderAnswer(msgspec.Struct, frozen=True, tag="answer"):
 
 
 class EndReport(msgspec.Struct, frozen=True, tag="ends"):
-    """The last report: how it ended, and the reason in words. `bad_params`: its parameters are no good anywhere."""
+    """The last report: how the component ended, and a reason for people. `bad_params`: don't restart it, on any
+    host."""
 
     how: HowEnded
     reason: str = ""
@@ -88,15 +89,16 @@ ComponentReport: TypeAlias = PhaseReport | OrderAnswer | EndReport
 
 
 def pack(message: msgspec.Struct) -> bytes:
-    """A message as a frame. Raises BadFrame if it is too long."""
+    """Encode a message as a frame. Raises BadFrame if it is too long."""
     body = msgspec.json.encode(message, enc_hook=str)
     if len(body) >= MAX_FRAME:
-        raise BadFrame(f"{len(body)} bytes are too many; less than {MAX_FRAME} go in one frame")
+        raise BadFrame(f"a frame of {len(body)} bytes is too long; the limit is {MAX_FRAME}")
     return body + b"\n"
 
 
 def receive(connection: BinaryIO, kind: Any) -> Any:
-    """The next message, of `kind`; None when the other side has closed, be it half-way. Raises BadFrame."""
+    """Return the next message, of `kind`, or None once the other side has closed, even within a frame. Raises
+    BadFrame."""
     try:
         line = connection.readline(MAX_FRAME)
     except ConnectionError:
@@ -109,7 +111,7 @@ def receive(connection: BinaryIO, kind: Any) -> Any:
 
 
 async def read(stream: asyncio.StreamReader, kind: Any) -> Any:
-    """The same for a stream, whose limit is MAX_FRAME."""
+    """Like `receive`, from a stream whose limit is MAX_FRAME."""
     try:
         return _unpack(await stream.readuntil(b"\n"), kind)
     except (asyncio.IncompleteReadError, ConnectionError):
@@ -118,7 +120,7 @@ async def read(stream: asyncio.StreamReader, kind: Any) -> Any:
         raise BadFrame(_TOO_LONG) from None
 
 
-_TOO_LONG: Final = f"a frame of more than {MAX_FRAME} bytes comes"
+_TOO_LONG: Final = f"received a frame of more than {MAX_FRAME} bytes"
 
 
 def _unpack(body: bytes, kind: Any) -> Any:

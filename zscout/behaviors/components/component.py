@@ -1,6 +1,6 @@
-"""What the author of a component writes, and what a component is given: docs/components.md shows one.
+"""The base class of components, and the context in which they run; docs/components.md has an example.
 
-It is found by its entry point of the group `zscout.components`.
+zscout finds a component class by its entry point in the group `zscout.components`.
 """
 
 from __future__ import annotations
@@ -19,22 +19,23 @@ if TYPE_CHECKING:  # a node looks at this module and needs no client
 
 GROUP: Final = "zscout.components"
 BAD_PARAMS: Final = 78
-"""Exit code (EX_CONFIG) of a component whose parameters are no good: it is not started again, here or elsewhere."""
+"""Exit code (EX_CONFIG) of a component with invalid parameters: it is not restarted, on any host."""
 
 
 class Component:
-    """Base class of components. An instance is made in the process that runs it, before that process joins the mesh."""
+    """Base class of components. Each runs in a process of its own, which makes the instance before it joins the
+    mesh."""
 
     def __init__(self, params: dict[str, Any]) -> None:
-        """`params` are those of the component. Raise ValueError with one line if they are bad: the component is then
-        given up with that line. For problems found later, exit with `sys.exit(BAD_PARAMS)`."""
+        """Raise ValueError, with one line, for invalid `params`: the component is then given up, with that line as its
+        reason. For problems found later, call `sys.exit(BAD_PARAMS)`."""
 
     async def run(self, context: ComponentContext) -> None:
-        """Do the work. Cancelled to end the component; `async with` then gives back its devices."""
+        """Do the work until cancelled, which ends the component; `async with` then gives back its devices."""
         raise NotImplementedError(f"{type(self).__name__} has no run(); write one")
 
     def checkpoint(self) -> bytes:
-        """Return the state, at most MAX_CHECKPOINT bytes (4 MB). Called while `run` is held at a safe point."""
+        """Return the state, at most MAX_CHECKPOINT bytes (4 MB). Called while `run` waits at a safe point."""
         raise NotImplementedError
 
     def restore(self, state: bytes) -> None:
@@ -43,7 +44,7 @@ class Component:
 
 
 def is_movable(component: Component) -> bool:
-    """Whether a component can give and take a checkpoint."""
+    """Return True if the class of `component` defines both `checkpoint` and `restore`."""
     kind = type(component)
     return kind.checkpoint is not Component.checkpoint and kind.restore is not Component.restore
 
@@ -57,52 +58,53 @@ class ComponentContext:
         self.component = component
         """The component's name."""
         self.incarnation = incarnation
-        """The number of this start of the component."""
+        """The number of this start of the component; each later start has a higher one."""
         self._gate = gate
 
     async def safe_point(self) -> None:
-        """Allow a checkpoint or a move here, where the state is complete. Call it often: it takes next to no time.
-        Until it returns, no other task of the component may change the state."""
-        await self._gate.come()
+        """Allow a checkpoint or a move at this point. Await it often, wherever the state is complete: it costs almost
+        no time. Until it returns, no other task of the component may change the state."""
+        await self._gate.enter()
 
 
 Stage = ComponentContext
-"""Its former name, for components written with it."""
+"""Former name of ComponentContext, kept for components that import it."""
 
 
 class SafePointGate:
-    """Where `run` is held at a safe point."""
+    """Pauses `run` at a safe point while a checkpoint is taken or the component moves."""
 
     def __init__(self) -> None:
         self._open = asyncio.Event()
         self._open.set()
-        self._come = asyncio.Event()
-        self._held = 0
+        self._entered = asyncio.Event()
+        self._waiting = 0
 
-    async def come(self) -> None:
+    async def enter(self) -> None:
+        """Wait while the gate is held."""
         await asyncio.sleep(0)
         while not self._open.is_set():
-            self._held += 1
-            self._come.set()
+            self._waiting += 1
+            self._entered.set()
             try:
                 await self._open.wait()
             finally:
-                self._held -= 1
+                self._waiting -= 1
 
     @property
     def holds(self) -> bool:
-        """Whether something is held here now: not any more where it was cancelled."""
-        return self._held > 0
+        """Return True while a task waits in `enter`; a task that was cancelled there no longer counts."""
+        return self._waiting > 0
 
     async def hold(self, patience: float) -> bool:
-        """Holds what comes from now on; False, and nothing is held, if nothing came within `patience`
-        seconds. `release` ends it."""
+        """Close the gate and wait until a task has entered. Return False, with the gate open again, if none has within
+        `patience` seconds."""
         self._open.clear()
         try:
             async with asyncio.timeout(patience):
                 while not self.holds:
-                    self._come.clear()
-                    await self._come.wait()
+                    self._entered.clear()
+                    await self._entered.wait()
         except BaseException as error:
             self.release()
             if isinstance(error, TimeoutError):
@@ -114,16 +116,16 @@ class SafePointGate:
         self._open.set()
 
 
-# Which kinds are installed: the entry points of GROUP
+# Installed kinds: the entry points of GROUP
 
 
 class BadKind(Exception):
-    """A component of this kind can't be made here; one line that says why."""
+    """A component of this kind can't be made on this host; the message is one line."""
 
 
 def installed_kinds() -> dict[str, str]:
-    """Where each kind is: its name, and `module:class`. Reads the metadata of all packages: some 10 ms. A kind that two
-    packages bring, in different places, is none: which one is meant nobody knows."""
+    """Return `module:class` by name of kind. Reads the metadata of all packages, in some 10 ms. A kind that two
+    packages register with different classes is ambiguous, and left out."""
     found: dict[str, set[str]] = {}
     for entry in metadata.entry_points(group=GROUP):
         with suppress(BadName):
@@ -132,7 +134,8 @@ def installed_kinds() -> dict[str, str]:
 
 
 def load_kind(kind: str, where: str) -> type[Component]:
-    """The class of a kind at `where`, as `installed_kinds` gives it. Raises BadKind, and what its import raises."""
+    """Import the class of a kind from `where`, a value of `installed_kinds`. Raises BadKind, or any error of the
+    import."""
     module_name, _, attributes = where.partition(":")
     try:
         found: Any = importlib.import_module(module_name.strip())

@@ -1,4 +1,4 @@
-"""The life of one component in its process: made, standing by, running, held, moved, ended."""
+"""Life cycle of one component within its process: made, on standby, running, paused, moved, ended."""
 
 from __future__ import annotations
 
@@ -31,24 +31,25 @@ from zscout.mesh import Declaration, MeshError
 from zscout.mesh.supervision import Supervisor, done_within
 from zscout.messages import MAX_ERROR, MoveComponent, Problem, RestoreComponent, Who
 
-STAND_BY: Final = 30.0
-"""Seconds that one stands by without being restored or activated, and then again until it is activated."""
-LINKED: Final = 1.0
-"""Seconds in which one that stands by may find the RCM: without a link to it, it can't be handed anything."""
-REACHED: Final = 3.0
-"""Seconds in which it may find the RCs that it is to hold: without a link to them it would lose the holds."""
-CLOSE: Final = 4.0
-"""Seconds for giving back what it holds."""
-SUPERSEDED: Final = 0.5
-"""Seconds that a superseded one has to clean up."""
+STANDBY_TIMEOUT: Final = 30.0
+"""Seconds on standby until it must be restored or activated; once restored, it has as long again to be activated."""
+RCM_LINK_TIMEOUT: Final = 1.0
+"""Seconds on standby to find the RCM: without a link to the RCM it can't receive a hold."""
+RC_LINK_TIMEOUT: Final = 3.0
+"""Seconds to find the RCs of the holds that it receives: without a link to them it would lose those holds."""
+CLOSE_TIMEOUT: Final = 4.0
+"""Seconds to give back its holds."""
+SUPERSEDED_CLEANUP: Final = 0.5
+"""Seconds that a superseded component has to clean up."""
 
 
 class BadParams(BadKind):
-    """What a component was given is no good."""
+    """A component's parameters are invalid."""
 
 
 class ComponentLifecycle:
-    """Runs the component of `job`. `report` sends one to the node, waited for or not; `connect` is `Client.connect`."""
+    """Runs the component of `job`. `report` sends a report to the node; its future is done once it is sent. Tests
+    replace `connect`."""
 
     def __init__(
         self,
@@ -57,9 +58,9 @@ class ComponentLifecycle:
         connect: Callable[..., Coroutine[Any, Any, Client]] = Client.connect,
     ) -> None:
         self._job, self._report, self._connect = job, report, connect
-        self._story: asyncio.Task[EndReport] | None = None
-        self._wanted: EndReport | None = None
-        """How it is to end, once something wants it to."""
+        self._main_task: asyncio.Task[EndReport] | None = None
+        self._requested_end: EndReport | None = None
+        """How it ends, once an end has been requested."""
         self._client: Client | None = None
         self._component: Component | None = None
         self._gate = SafePointGate()
@@ -69,47 +70,49 @@ class ComponentLifecycle:
         self._instance = f"{job.start.incarnation}-{new_instance()}"
         self._restored = asyncio.Event()
         self._activated = asyncio.Event()
-        self._handed = asyncio.Event()
-        """It has been handed an ARC, and no older incarnation is seen: nobody will activate it."""
-        self._older: set[str] = set()
-        """Instances of older incarnations that are seen."""
-        self._alone = asyncio.Event()
-        """None is."""
-        self._alone.set()
-        self._accompanied = asyncio.Event()
-        """One is."""
-        self._left = asyncio.Event()
-        """It is over here, whatever run() does: another one goes on."""
-        self._away: EndReport | None = None
-        """How, once that is so."""
+        self._received_alone = asyncio.Event()
+        """It has received an ARC and no older incarnation is on the mesh, which could still activate it."""
+        self._older_instances: set[str] = set()
+        """Instances of older incarnations on the mesh."""
+        self._no_older_instance = asyncio.Event()
+        """Set while `_older_instances` is empty."""
+        self._no_older_instance.set()
+        self._older_instance_seen = asyncio.Event()
+        """Set while `_older_instances` is not empty."""
+        self._left_mesh = asyncio.Event()
+        """Another incarnation runs: this one has ended, even if its run() has not returned."""
+        self._departure_report: EndReport | None = None
+        """The report of that end."""
         self._supervisor = Supervisor(
-            f"component {job.client}", lambda error: self.end(EndReport("failed", _words(error)))
+            f"component {job.client}", lambda error: self.end(EndReport("failed", _error_line(error)))
         )
 
     async def run(self) -> EndReport:
-        """Returns how it ended, when all that it held has been given back, or handed over."""
-        story = self._story = asyncio.create_task(self._run_story())
-        if self._wanted is not None:
-            story.cancel()
-        left = asyncio.create_task(self._left.wait())
-        await asyncio.wait({story, left}, return_when=asyncio.FIRST_COMPLETED)
+        """Run the component to its end; return once all its holds are given back or handed over."""
+        main_task = self._main_task = asyncio.create_task(self._run_component())
+        if self._requested_end is not None:
+            main_task.cancel()
+        left = asyncio.create_task(self._left_mesh.wait())
+        await asyncio.wait({main_task, left}, return_when=asyncio.FIRST_COMPLETED)
         if left.done():
-            # run() stays where it is: to unwind it would give up what another one holds now.
-            ends = self._away or EndReport("moved")
+            # run() is not unwound: that would give back holds that another incarnation has now.
+            end_report = self._departure_report or EndReport("moved")
             if self._client is not None:
                 await self._client.internals.leave()
-            return ends
+            return end_report
         left.cancel()
         try:
-            ends = story.result()
+            end_report = main_task.result()
         except (Exception, asyncio.CancelledError) as error:  # noqa: BLE001 - the author's code
-            if self._wanted is None or not isinstance(error, asyncio.CancelledError):
+            if self._requested_end is None or not isinstance(error, asyncio.CancelledError):
                 traceback.print_exception(error)
-            ends = self._wanted or EndReport("failed", _words(error))
+            end_report = self._requested_end or EndReport("failed", _error_line(error))
         await self._supervisor.close()
         if self._client is not None:
-            await done_within(SUPERSEDED if ends.how == "superseded" else CLOSE, self._client.close())
-        return ends
+            await done_within(
+                SUPERSEDED_CLEANUP if end_report.how == "superseded" else CLOSE_TIMEOUT, self._client.close()
+            )
+        return end_report
 
     def order(self, order: Order) -> None:
         match order.operation:
@@ -118,29 +121,29 @@ class ComponentLifecycle:
             case messages.ActivateComponent():
                 self._activated.set()
             case messages.CheckpointComponent():
-                self._supervisor.spawn(self._or_decline(order.number, self._take_checkpoint))
+                self._supervisor.spawn(self._answer_or_decline(order.number, self._take_checkpoint))
             case MoveComponent() as move:
-                self._supervisor.spawn(self._or_decline(order.number, self._move_away, move))
+                self._supervisor.spawn(self._answer_or_decline(order.number, self._move_away, move))
             case RestoreComponent() as restore:
-                self._supervisor.spawn(self._or_decline(order.number, self._take_in, restore))
+                self._supervisor.spawn(self._answer_or_decline(order.number, self._restore, restore))
 
-    def end(self, ends: EndReport) -> None:
-        """Has it end; of several ends the first is reported. A move that has begun is called off; if it is
-        committed, another one goes on and this one is over anyhow."""
-        if self._wanted is not None:
+    def end(self, end_report: EndReport) -> None:
+        """End the component; the first of several ends is reported. A move under way is called off unless it is
+        committed, in which case the component continues in its new process."""
+        if self._requested_end is not None:
             return
-        self._wanted = ends
+        self._requested_end = end_report
         if self._move is not None:
-            self._move.called_off = "it is to end"
-        if self._story is not None and (self._move is None or not self._move.began):
-            self._story.cancel()
+            self._move.called_off = "the component is being stopped"
+        if self._main_task is not None and (self._move is None or not self._move.began):
+            self._main_task.cancel()
 
-    # What happens to it
+    # The main task
 
-    async def _run_story(self) -> EndReport:
+    async def _run_component(self) -> EndReport:
         job = self._job
         connecting = asyncio.create_task(self._connect(job.client, fleet=job.fleet, host=job.host))
-        # It joins the mesh in a thread: what follows is done meanwhile.
+        # The client joins the mesh in a thread; meanwhile the kind is imported.
         await asyncio.sleep(0)
         try:
             try:
@@ -148,7 +151,7 @@ class ComponentLifecycle:
             finally:
                 client = self._client = await connecting
                 client.who = replace(client.who or Who(), command=bounded(f"component {job.start.component}"))
-                # Whoever started it may have started it before its devices.
+                # It may have been started before the devices of its fleet.
                 client.waits_for_devices = True
             made = self._component = self._make(kind)
         except (BadKind, MeshError) as error:
@@ -156,13 +159,15 @@ class ComponentLifecycle:
         movable = is_movable(made)
         with closing(client.mesh.watch(client.mesh.keys.alive_any(Role.COMPONENT), self._on_component)):
             if job.start.standby:
-                await _finds(client, Role.RCM, [lambda _: True], LINKED)
+                await _wait_for_names(client, Role.RCM, [lambda _: True], RCM_LINK_TIMEOUT)
                 await self._report(PhaseReport("standby", movable))
-                # Once restored it has as long again to be activated, or handed an ARC.
-                called = self._activated, self._handed
-                self._supervisor.spawn(self._see_handed(client))
-                if not await _first(STAND_BY, *called, self._restored) or not await _first(STAND_BY, *called):
-                    return EndReport("stopped", f"it stood by for {STAND_BY:g} s and nothing was handed to it")
+                # Once restored, it has as long again to be activated or to receive an ARC.
+                called = self._activated, self._received_alone
+                self._supervisor.spawn(self._await_handover(client))
+                if not await _wait_for_any(STANDBY_TIMEOUT, *called, self._restored) or not await _wait_for_any(
+                    STANDBY_TIMEOUT, *called
+                ):
+                    return EndReport("stopped", f"on standby for {STANDBY_TIMEOUT:g} s, and no component moved here")
             return await self._perform(client, made, movable)
 
     def _load(self) -> type[Component]:
@@ -172,54 +177,55 @@ class ComponentLifecycle:
             raise
         except Exception as error:  # noqa: BLE001 - the author's code
             traceback.print_exc()
-            raise BadKind(f"its kind can't be imported: {_words(error)}") from None
+            raise BadKind(f"its kind can't be imported: {_error_line(error)}") from None
 
     def _make(self, kind: type[Component]) -> Component:
         limit_allocations(self._job.memory)
         try:
             return kind(self._job.start.spec.params)
         except ValueError as error:
-            raise BadParams(f"bad parameters: {_words(error, named=False)}") from None
+            raise BadParams(f"bad parameters: {_error_line(error, named=False)}") from None
         except Exception as error:  # noqa: BLE001 - the author's code
             traceback.print_exc()
-            raise BadKind(f"it can't be made: {_words(error)}") from None
+            raise BadKind(f"it can't be made: {_error_line(error)}") from None
 
     async def _perform(self, client: Client, component: Component, movable: bool) -> EndReport:
         start, host = self._job.start, self._job.host
         token: Declaration = client.mesh.alive(Token(host, Role.COMPONENT, start.component, self._instance))
         self._running = True
         try:
-            # Not waited for: nothing comes between this and its first step.
+            # Don't await it: the component starts without delay.
             self._report(PhaseReport("running", movable))
             await component.run(ComponentContext(client, start.component, start.incarnation, self._gate))
         except asyncio.CancelledError:
-            if self._wanted is None:
+            if self._requested_end is None:
                 raise
         except SystemExit as left:
             if left.code == BAD_PARAMS:
                 words = f"it left with code {BAD_PARAMS}: its parameters are no good; see its output"
-                return self._wanted or EndReport("failed", words, bad_params=True)
+                return self._requested_end or EndReport("failed", words, bad_params=True)
             if left.code:
-                return self._wanted or EndReport("failed", f"it left with {left.code!r}")
+                return self._requested_end or EndReport("failed", f"it left with {left.code!r}")
         except Exception as error:
-            if self._wanted is None:
+            if self._requested_end is None:
                 raise
             traceback.print_exception(error)
         finally:
             self._running = False
             token.close()
-        return self._wanted or EndReport("completed")
+        return self._requested_end or EndReport("completed")
 
     # Orders that are answered
 
-    async def _or_decline(self, number: int, carry_out: Callable[..., Awaitable[None]], *what: Any) -> None:
+    async def _answer_or_decline(self, number: int, carry_out: Callable[..., Awaitable[None]], *what: Any) -> None:
         try:
             await carry_out(number, *what)
         except NotMoved as refused:
             await self._report(OrderAnswer(number, problem=Problem(refused.code, str(refused))))
 
     def _movable(self, *, standby: bool = False) -> tuple[Component, Client]:
-        """Raises NotMoved where it does not run, or stand by, or can't be moved at all."""
+        """Return the component and its client. Raises NotMoved if it is neither running nor on standby, as `standby`
+        requires, or has no checkpoint() and restore()."""
         component, client = self._component, self._client
         fits = self._job.start.standby and not self._running if standby else self._running
         if component is None or client is None or not fits:
@@ -249,45 +255,45 @@ class ComponentLifecycle:
                 dead = await self._move.carry_out()
             except BaseException as error:
                 self._move = None
-                if self._left.is_set() and isinstance(error, Exception):
-                    return  # another one goes on: this one has left the mesh
-                if self._wanted is not None and self._story is not None:
-                    self._story.cancel()
+                if self._left_mesh.is_set() and isinstance(error, Exception):
+                    return  # another incarnation runs: this process has left the mesh
+                if self._requested_end is not None and self._main_task is not None:
+                    self._main_task.cancel()
                 if isinstance(error, NotMoved) or not isinstance(error, Exception):
                     raise
                 traceback.print_exc()
-                raise NotMoved("move_failed", _words(error)) from None
-            self._away = EndReport("moved")
+                raise NotMoved("move_failed", _error_line(error)) from None
+            self._departure_report = EndReport("moved")
             await self._report(OrderAnswer(number, dead=dead))
-            self._left.set()
+            self._left_mesh.set()
 
-    async def _take_in(self, number: int, handed: RestoreComponent) -> None:
+    async def _restore(self, number: int, handed: RestoreComponent) -> None:
         component, client = self._movable(standby=True)
         held = [need for request in handed.requests if request.grant is not None for need in request.needs]
-        if not await _finds(client, Role.RC, [matcher(need) for need in held], REACHED):
+        if not await _wait_for_names(client, Role.RC, [matcher(need) for need in held], RC_LINK_TIMEOUT):
             words = f"{self._job.host} does not reach {', '.join(held)}, or not all of them"
             raise NotMoved("start_failed", words)
         try:
             component.restore(handed.state)
         except Exception as error:  # noqa: BLE001 - the author's code
             traceback.print_exc()
-            words = f"restore() failed: {_words(error)}"
+            words = f"restore() failed: {_error_line(error)}"
             self.end(EndReport("failed", words))
             raise NotMoved("start_failed", words) from None
         try:
             client.internals.expect(handed.requests)
         except (BadName, ValueError) as error:
-            raise NotMoved("bad_request", _words(error, named=False)) from None
+            raise NotMoved("bad_request", _error_line(error, named=False)) from None
         self._restored.set()
         await self._report(OrderAnswer(number))
 
-    async def _see_handed(self, client: Client) -> None:
+    async def _await_handover(self, client: Client) -> None:
         await client.internals.expected_came.wait()
-        await self._alone.wait()
-        # After a partition the link to the older one may come back a little later than that to the RCM.
-        while await done_within(client.fleet.mesh.lease, self._accompanied.wait()):
-            await self._alone.wait()
-        self._handed.set()
+        await self._no_older_instance.wait()
+        # After a partition, the link to the older incarnation may return a little later than the link to the RCM.
+        while await done_within(client.fleet.mesh.lease, self._older_instance_seen.wait()):
+            await self._no_older_instance.wait()
+        self._received_alone.set()
 
     def _on_component(self, token: Token, alive: bool) -> None:
         if token.name != self._job.start.component:
@@ -297,23 +303,23 @@ class ComponentLifecycle:
         except BadName:
             return
         if incarnation < self._job.start.incarnation:
-            (self._older.add if alive else self._older.discard)(token.instance)
-            (self._alone.clear if self._older else self._alone.set)()
-            (self._accompanied.set if self._older else self._accompanied.clear)()
+            (self._older_instances.add if alive else self._older_instances.discard)(token.instance)
+            (self._no_older_instance.clear if self._older_instances else self._no_older_instance.set)()
+            (self._older_instance_seen.set if self._older_instances else self._older_instance_seen.clear)()
         if not alive:
             return
         if self._move is not None and incarnation == self._move.incarnation:
             self._move.successor_runs.set()
-        # Two placers that did not see each other may have given the same number.
+        # Two placers on different sides of a partition may have assigned the same number.
         elif (incarnation, token.host, token.instance) > (self._job.start.incarnation, self._job.host, self._instance):
-            ends = EndReport("superseded", f"incarnation {incarnation} runs on {token.host}")
-            self._away = self._away or ends
-            self.end(ends)
-            asyncio.get_running_loop().call_later(SUPERSEDED, self._left.set)
+            end_report = EndReport("superseded", f"incarnation {incarnation} runs on {token.host}")
+            self._departure_report = self._departure_report or end_report
+            self.end(end_report)
+            asyncio.get_running_loop().call_later(SUPERSEDED_CLEANUP, self._left_mesh.set)
 
 
-async def _finds(client: Client, role: str, names: list[Callable[[str], bool]], timeout: float) -> bool:
-    """Waits until for each of `names` a token of this role is seen, at most `timeout` seconds."""
+async def _wait_for_names(client: Client, role: str, names: list[Callable[[str], bool]], timeout: float) -> bool:
+    """Wait until each of `names` accepts the name of some token of this role; return False after `timeout` seconds."""
     missing, found = list(names), asyncio.Event()
 
     def on_token(token: Token, alive: bool) -> None:
@@ -325,8 +331,8 @@ async def _finds(client: Client, role: str, names: list[Callable[[str], bool]], 
         return not missing or await done_within(timeout, found.wait())
 
 
-async def _first(timeout: float, *events: asyncio.Event) -> bool:
-    """Waits until one of these is set; False if none is within `timeout` seconds."""
+async def _wait_for_any(timeout: float, *events: asyncio.Event) -> bool:
+    """Wait until any of `events` is set; return False after `timeout` seconds."""
     waits = [asyncio.ensure_future(event.wait()) for event in events]
     try:
         done, _ = await asyncio.wait(waits, timeout=timeout, return_when=asyncio.FIRST_COMPLETED)
@@ -336,8 +342,8 @@ async def _first(timeout: float, *events: asyncio.Event) -> bool:
     return bool(done)
 
 
-def _words(error: BaseException, *, named: bool = True) -> str:
-    """An error in one line."""
+def _error_line(error: BaseException, *, named: bool = True) -> str:
+    """Return an error's message on one line, with its class name if `named`."""
     text = " ".join(str(error).split())[:MAX_ERROR]
     name = type(error).__name__
     return f"{name}: {text}" if text and named else text or name

@@ -1,7 +1,7 @@
-"""The source's side of a move: it hands over what it holds to an incarnation of itself that stands by.
+"""A move, as the moving component carries it out: it hands its state and its holds to its successor on standby.
 
-Up to the hand-over at the RCM (or, without ARCs, up to the word that the other one runs) it can go on as if
-nothing had been asked. From then on it stays paused until the other one is known to run, or to be gone.
+Until the RCM has the hand-over (without ARCs: until the successor runs) the move can be called off, and the component
+continues here unchanged. After that it stays paused until it learns that the successor runs, or is gone.
 """
 
 from __future__ import annotations
@@ -22,16 +22,16 @@ R = TypeVar("R")
 Operation = messages.RestoreComponent | messages.ActivateComponent | messages.StopComponent | messages.ListComponents
 
 RESTORE_TIMEOUT: Final = 10.0
-ASK_TIMEOUT: Final = 2.0
+QUERY_TIMEOUT: Final = 2.0
 LOOK_TIMEOUT: Final = 0.5
-GONE: Final = 2 * SECOND
-"""Since the other node was last seen, until it counts as gone."""
+GONE_AFTER: Final = 2 * SECOND
+"""Nanoseconds without a sign of the other node after which it counts as gone."""
 PAUSES: Final = (0.02, 1.0)
-"""Seconds between two askings of the other node: at first, and at most."""
+"""Seconds between two queries to the other node: first and longest."""
 
 
 class NotMoved(Exception):
-    """It goes on here. `code` is the protocol's."""
+    """The move failed, and the component continues here. `code` is the protocol's."""
 
     def __init__(self, code: str, message: str) -> None:
         super().__init__(message[:MAX_ERROR])
@@ -39,7 +39,7 @@ class NotMoved(Exception):
 
 
 def state_of(component: Component) -> bytes:
-    """The checkpoint of a component that is held at a safe point. Raises NotMoved."""
+    """Return the checkpoint of a component that waits at a safe point. Raises NotMoved."""
     try:
         state = component.checkpoint()
     except Exception as error:
@@ -57,18 +57,18 @@ class OutgoingMove:
         self._name, self.to, self.incarnation = order.component, order.to, order.to_incarnation
         self._patience = order.patience
         self.successor_runs = asyncio.Event()
-        """To be set when the token of the other incarnation is seen: it runs, whatever else is known."""
+        """Set by the lifecycle once the successor's token is on the mesh: it runs, whatever its node answers."""
         self.began = False
-        """Whether the component is held for it."""
+        """True once the component is paused for this move."""
         self._seen: Ns | None = None
-        """When the other process, or its node, was last seen."""
+        """When the successor's process or its node was last seen."""
         self.called_off = ""
-        """Why it must not be, as long as it is not committed."""
+        """Set to a reason to call the move off, which works until it is committed."""
 
     async def carry_out(self) -> float:
-        """Returns how long (s) the component did not run, once the other one does: this process is to end
-        then, and to give up nothing. Raises NotMoved where it goes on here."""
-        await self._lives()
+        """Return, once the successor runs, for how many seconds the component was paused. This process must then end
+        without giving back any hold. Raises NotMoved if the component continues here."""
+        await self._look_for_successor()
         if not await self._gate.hold(self._patience):
             raise NotMoved("not_safe", f"it reached no safe point within {self._patience:g} s")
         began, self.began = self._client.mesh.now(), True
@@ -76,7 +76,7 @@ class OutgoingMove:
         try:
             await self._hand_over()
         except BaseException:
-            # What was not handed over goes on; what was taken back is asked anew already.
+            # Requests that were not handed over continue; those taken back are already submitted again.
             self._client.internals.resume()
             self._gate.release()
             raise
@@ -86,24 +86,24 @@ class OutgoingMove:
         state, requests = state_of(self._component), self._client.internals.open_requests()
         await self._give(state, requests)
         if not self._gate.holds:
-            raise NotMoved("move_failed", "it left its safe point: a hold of it ended just then")
+            raise NotMoved("move_failed", "it left its safe point because one of its holds ended")
         if self.called_off:
             raise NotMoved("move_failed", self.called_off)
         if not requests:
-            if not await self._confirmed():
+            if not await self._activate_successor():
                 raise NotMoved("move_failed", f"incarnation {self.incarnation} on {self.to} ended")
             return
-        words = f"incarnation {self.incarnation} on {self.to} ended; its ARCs are asked anew here"
+        words = f"incarnation {self.incarnation} on {self.to} ended; its requests are submitted again here"
         try:
             await self._client.internals.hand_over_all(Sender(self.to, f"{self._name}.{self.incarnation}"))
         except RequestRefused as refused:
             if refused.code != "unknown":
                 words = f"the RCM refused the hand-over: {refused}"
-            # One that it replaced may have carried it out.
-            going_on = await self._stop_there()
+            # An earlier RCM may have carried it out.
+            successor_runs = await self._stop_successor()
         else:
-            going_on = await self._confirmed()
-        if not going_on:
+            successor_runs = await self._activate_successor()
+        if not successor_runs:
             self._client.internals.take_back()
             raise NotMoved("move_failed", words)
 
@@ -115,11 +115,11 @@ class OutgoingMove:
         pause, longest = PAUSES
         left = RESTORE_TIMEOUT
         while (reply := await self._ask(order, ComponentView, left)) is None:
-            # No answer comes at once where there is no link yet to a node that has just come; one that has been gone
-            # for a while does not come back.
-            await self._lives()
+            # Without a link the query returns at once. A node that has just joined may get its link soon; a node that
+            # has been gone for a while does not return.
+            await self._look_for_successor()
             now = self._client.mesh.now()
-            if self._seen is not None and now - self._seen > GONE:
+            if self._seen is not None and now - self._seen > GONE_AFTER:
                 break
             left = (deadline - now) / SECOND - pause
             if left <= 0:
@@ -133,49 +133,54 @@ class OutgoingMove:
         if reply.phase != "standby":
             raise NotMoved("move_failed", f"it is {reply.phase} on {self.to}; {reply.reason}")
 
-    async def _confirmed(self) -> bool:
-        """Has the other one run, and waits for as long as that is not known. False: it is gone."""
-        return await self._until_known(messages.ActivateComponent(self._name, self.incarnation))
+    async def _activate_successor(self) -> bool:
+        """Activate the successor. Return True once it runs, False once it is gone; wait while neither is known."""
+        return await self._repeat_until_known(messages.ActivateComponent(self._name, self.incarnation))
 
-    async def _stop_there(self) -> bool:
-        """It is unknown whether an RCM carried out the hand-over: whoever runs by now has the ARCs. False: the
-        other one did not, and will not."""
-        reply = await self._ask(messages.ListComponents(self._name), messages.ComponentList, ASK_TIMEOUT)
+    async def _stop_successor(self) -> bool:
+        """Stop the successor unless it runs already, for when the RCM's answer to the hand-over is lost: a running
+        successor has the ARCs. Return True if it has run, False if it never will."""
+        reply = await self._ask(messages.ListComponents(self._name), messages.ComponentList, QUERY_TIMEOUT)
         if isinstance(reply, messages.ComponentList) and any(
             view.incarnation == self.incarnation and view.phase == "running" for view in reply.components
         ):
-            return await self._confirmed()
-        return await self._until_known(messages.StopComponent(self._name, self.incarnation, grace=0.0))
+            return await self._activate_successor()
+        return await self._repeat_until_known(messages.StopComponent(self._name, self.incarnation, grace=0.0))
 
-    async def _until_known(self, operation: messages.ActivateComponent | messages.StopComponent) -> bool:
+    async def _repeat_until_known(self, operation: messages.ActivateComponent | messages.StopComponent) -> bool:
         (pause, longest), began = PAUSES, self._client.mesh.now()
-        # Cut off, the other one runs a lease after it lost sight of this one: it is to be the first of the two.
-        gone = max(GONE, round(2 * self._client.fleet.mesh.lease * SECOND))
+        # A successor that is cut off starts one lease after it lost sight of this process. Give it the time to.
+        gone = max(GONE_AFTER, round(2 * self._client.fleet.mesh.lease * SECOND))
         while not self.successor_runs.is_set():
-            match await self._ask(operation, ComponentView, ASK_TIMEOUT):
+            match await self._ask(operation, ComponentView, QUERY_TIMEOUT):
                 case ComponentView(phase="running"):
                     return True
                 case ComponentView(phase="ended", ended=how):
-                    # Who completed had run: what it did must not be done again.
+                    # A successor that completed had run: its work must not be repeated.
                     return how in ("completed", "moved", "superseded")
                 case Problem(code="unknown_component"):
                     return False
                 case Problem(code="old_incarnation"):
-                    return True  # one that is higher still was started there: this one is over in any case
-                case None if not await self._lives() and self._client.mesh.now() - max(self._seen or 0, began) > gone:
+                    return True  # a later incarnation was started there: this one ends in any case
+                case None if (
+                    not await self._look_for_successor()
+                    and self._client.mesh.now() - max(self._seen or 0, began) > gone
+                ):
                     return False
             if not await done_within(pause, self.successor_runs.wait()):
                 pause = min(longest, 2 * pause)
         return True
 
-    async def _lives(self) -> bool:
-        """Whether the other process may still be there. It outlives its node by moments: once its client's
-        token has gone, nothing of it will be heard any more."""
+    async def _look_for_successor(self) -> bool:
+        """Return True if the successor's process may still live: its node or its client has a token. The process
+        outlives its node by moments only, and sends nothing once its client's token is gone."""
         mesh = self._client.mesh
         looks = (mesh.living(mesh.keys.alive_any(role), timeout=LOOK_TIMEOUT) for role in (Role.NODE, Role.CLIENT))
         nodes, clients = await asyncio.gather(*looks)
         its = self.to, f"{self._name}.{self.incarnation}"
-        lives = any(node.host == self.to for node in nodes) or any((one.host, one.name) == its for one in clients)
+        lives = any(node.host == self.to for node in nodes) or any(
+            (client.host, client.name) == its for client in clients
+        )
         if lives:
             self._seen = mesh.now()
         return lives

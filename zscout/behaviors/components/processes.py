@@ -1,7 +1,6 @@
-"""All processes of one component, killed together, and their limit of memory.
+"""Kill all processes of a component, and limit their memory.
 
-They are known by a variable in their environment, which children inherit: those that made themselves a group
-of their own as well.
+They are recognized by a variable in their environment, which children inherit, even in a process group of their own.
 """
 
 from __future__ import annotations
@@ -18,16 +17,16 @@ from typing import Final
 
 VARIABLE: Final = "ZSCOUT_COMPONENT"
 ROUNDS: Final = 20
-"""How often it is looked for those that were started meanwhile."""
+"""Most searches of /proc: processes may fork between two."""
 DYING: Final = 1.0
-"""Seconds that the killed have to die: one that hangs in the kernel may take for ever."""
+"""Seconds to wait for killed processes: one that hangs in the kernel may never die."""
 MAX_ENVIRONMENT: Final = 4_000_000
 """Bytes."""
 
 
 def kill_family(tag: str, *, spare: int = 0) -> int:
-    """Kills all processes in whose environment VARIABLE is `tag`, but for the process `spare`; returns how
-    many, once they are dead, or after DYING seconds. One that runs as another user can't be seen."""
+    """Kill all processes with VARIABLE=`tag` in their environment, except the process `spare`. Return their number once
+    they are dead, or after DYING seconds. Processes of other users can't be seen."""
     wanted = f"{VARIABLE}={tag}".encode()
     killed: dict[int, int] = {}
     try:
@@ -46,16 +45,16 @@ def kill_family(tag: str, *, spare: int = 0) -> int:
 
 
 def _names(folder: str) -> list[str]:
-    """Of what is in it; none where it can't be read."""
+    """Return the names in a folder; none if it can't be read."""
     with suppress(OSError):
         return os.listdir(folder)  # noqa: PTH208
     return []
 
 
 def _kill(pid: int, wanted: bytes) -> int | None:
-    """Kills `pid` if it is one of the family; returns a descriptor of it then."""
+    """Kill `pid` if `wanted` is in its environment, and return a pidfd of it; else return None."""
     try:
-        # A descriptor, not the number: that may have passed to another meanwhile.
+        # A pidfd rather than the pid, which the kernel may have reused.
         handle = os.pidfd_open(pid)
     except OSError:
         return None
@@ -68,7 +67,7 @@ def _kill(pid: int, wanted: bytes) -> int | None:
 
 
 def _wait(handles: Iterable[int]) -> None:
-    """Waits until these processes are dead: one that is killed still has its environment for a moment."""
+    """Wait until these processes are dead: a killed process keeps its environment for a moment."""
     poll = select.poll()
     dying = set(handles)
     for handle in dying:
@@ -81,11 +80,11 @@ def _wait(handles: Iterable[int]) -> None:
 
 
 def limit_allocations(limit: int) -> None:
-    """From now on this process, and each that it starts, uses no more than `limit` bytes: what it asks for
-    beyond that is a MemoryError. 0: no limit. For hosts that can't limit all processes of one together."""
+    """Limit this process, and each that it starts, to `limit` bytes in use; allocations beyond that raise MemoryError.
+    0: no limit. For hosts that can't limit the processes of a component together."""
     if limit <= 0:
         return
-    # Stacks and arenas that are reserved and not used count as data: only what is added from here on matters.
+    # RLIMIT_DATA also counts stacks and arenas that are reserved but unused, so leave those out.
     status = dict(line.split(":", 1) for line in Path("/proc/self/status").read_text().splitlines())
     reserved, used = (int(status[size].split()[0]) * 1024 for size in ("VmData", "VmRSS"))
     ceiling = reserved + max(0, limit - used)

@@ -1,7 +1,7 @@
 """The process of one component: `python -m zscout.behaviors.components.runner FD`, started by a node.
 
-FD is its end of a socket pair to the node. When the other end closes, for whatever reason, this process and
-all that it started are killed at once: a component can't outlive its node.
+FD is its end of a socket pair to the node. When the other end closes, for any reason, this process and all that it
+started are killed at once: a component can't outlive its node.
 """
 
 from __future__ import annotations
@@ -34,11 +34,11 @@ REPORT_LAST: Final = 2.0
 
 
 def main() -> None:
-    """Exit codes: 0 where the component ended well, 1 where it failed, BAD_PARAMS where its parameters are no good."""
+    """Exit with 0, with 1 if the component failed, or with BAD_PARAMS if its parameters are invalid."""
     if len(sys.argv) != 2 or not sys.argv[1].isdecimal() or os.getpgrp() != os.getpid():
         sys.exit("zscout: this program is started by a node; `zscout component start` starts a component")
     log_to_stderr("WARNING", "%(levelname)s %(message)s")
-    # A process that stands still sees no end of file: the end of its parent wakes it.
+    # A stopped process notices no end of file: SIGCONT at its parent's death makes it run again.
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGCONT, 0, 0, 0)
     connection = socket.socket(fileno=int(sys.argv[1]))
     connection.set_inheritable(False)
@@ -57,20 +57,20 @@ def main() -> None:
 
 async def _live(job: ComponentJob, connection: socket.socket, orders: BinaryIO) -> EndReport:
     loop = asyncio.get_running_loop()
-    # In a thread: a node that stands still must not hold up the component. In one, so that frames stay whole.
-    speaker = ThreadPoolExecutor(1)
+    # Sent by a thread, so that a stalled node doesn't delay the component; by only one, so that frames stay whole.
+    sender = ThreadPoolExecutor(1)
 
-    def report(one: ComponentReport) -> asyncio.Future[None]:
-        return loop.run_in_executor(speaker, _send, connection, channel.pack(one))
+    def send(report: ComponentReport) -> asyncio.Future[None]:
+        return loop.run_in_executor(sender, _send, connection, channel.pack(report))
 
-    life = ComponentLifecycle(job, report)
+    life = ComponentLifecycle(job, send)
     listening = orders, job.tag, lambda order: loop.call_soon_threadsafe(life.order, order)
-    threading.Thread(target=_listen, args=listening, daemon=True).start()
+    threading.Thread(target=_receive_orders, args=listening, daemon=True).start()
     loop.add_signal_handler(signal.SIGTERM, life.end, EndReport("failed", "ended by SIGTERM"))
     ends = await life.run()
-    await done_within(REPORT_LAST, report(ends))
+    await done_within(REPORT_LAST, send(ends))
     if ends.how in ("moved", "superseded"):
-        # Nothing that is left here may unwind: another one runs.
+        # Skip all cleanup: it would give back holds that another incarnation has now.
         sys.stdout.flush()
         sys.stderr.flush()
         os._exit(0)
@@ -78,15 +78,15 @@ async def _live(job: ComponentJob, connection: socket.socket, orders: BinaryIO) 
 
 
 def _send(connection: socket.socket, frame: bytes) -> None:
-    with suppress(OSError):  # the node is gone; whoever listens sees it
+    with suppress(OSError):  # the node is gone; the receiving thread sees that too
         connection.sendall(frame)
 
 
-def _listen(orders: BinaryIO, tag: str, deliver: Callable[[Order], object]) -> None:
-    """Receives orders until the node has closed, then kills all processes of this component, this one last. In a
-    thread: it must work while the component computes."""
+def _receive_orders(orders: BinaryIO, tag: str, deliver: Callable[[Order], object]) -> None:
+    """Deliver orders until the node closes, then kill all processes of this component, this one last. Runs in a thread,
+    since the component may block the event loop."""
     try:
-        with suppress(BadFrame, RuntimeError):  # the latter: the loop is closed
+        with suppress(BadFrame, RuntimeError):  # RuntimeError: the loop is closed
             while (order := channel.receive(orders, Order)) is not None:
                 deliver(order)
     finally:

@@ -24,23 +24,23 @@ from zscout.messages import BehaviorSaid, ComponentSpec
 MAX_ROBOTS: Final = 64
 MAX_PATH: Final = 100
 
-Priority = Annotated[int, key("Of an ARC.", -1000, 1000)]
+Priority = Annotated[int, key("Priority of an ARC.", -1000, 1000)]
 Slot = Annotated[float, key("Seconds that a hold is kept before another of its rank may have it.", 1, 3600)]
 
 
 class SharedParams(Struct, kw_only=True):
-    """Parameters of both kinds. `radio`, `video`, `framegrabber`: RCs or patterns, any of the kind at first.
-    `speed`: how many seconds of the robots' world pass in one of ours."""
+    """Parameters of both kinds. `radio`, `video`, `framegrabber`: names or patterns of RCs, by default any of the kind.
+    `speed`: seconds of the robots' simulated world per real second."""
 
     radio: str = "radio/*"
     video: str = "video/*"
     framegrabber: str = "framegrabber/*"
-    command_rate: Annotated[float, key("Commands in a second.", 0.5, 50)] = 5.0
+    command_rate: Annotated[float, key("Commands per second.", 0.5, 50)] = 5.0
     hide_priority: Priority = 2
     watch_priority: Priority = 1
     hide_slot: Slot = 60.0
     watch_slot: Slot = 30.0
-    speed: Annotated[float, key("Seconds in one of ours.", 0.01, 100)] = 1.0
+    speed: Annotated[float, key("Simulated seconds per real second.", 0.01, 100)] = 1.0
 
     def needs(self, robot: str) -> RobotNeeds:
         """Raises BadInput."""
@@ -54,9 +54,9 @@ class SharedParams(Struct, kw_only=True):
 
 
 class RobotParams(SharedParams):
-    """Parameters of `place_robot`. `above`: the path of the behavior that it belongs to."""
+    """Parameters of `place_robot`. `above`: path of its parent behavior."""
 
-    robot: Annotated[str, key("To be placed.", remedy="add one, as in robot/scout33")]
+    robot: Annotated[str, key("The robot to place.", remedy="add one, as in robot/scout33")]
     above: Annotated[str, Meta(max_length=MAX_PATH)] = ""
 
     def __post_init__(self) -> None:
@@ -64,12 +64,11 @@ class RobotParams(SharedParams):
 
 
 class NetParams(SharedParams):
-    """Parameters of `place_sensor_net`. `wanted`: how many robots are to be placed (all), the others stand in
-    for those that are lost; `name`: of its behavior and before the names of its components, so that a second
-    net needs another one."""
+    """Parameters of `place_sensor_net`. `wanted`: how many robots to place, by default all; the others replace lost
+    robots. `name`: name of its behavior and prefix of its components' names, so each net needs its own."""
 
     robots: Annotated[
-        tuple[str, ...], key("To be placed.", most=MAX_ROBOTS, remedy='add a list, as in ["robot/scout33"]')
+        tuple[str, ...], key("The robots to place.", most=MAX_ROBOTS, remedy='add a list, as in ["robot/scout33"]')
     ]
     wanted: int | None = None
     name: str = "place_sensor_net"
@@ -84,13 +83,13 @@ class NetParams(SharedParams):
             remedy = f"write a whole number from 1 to {len(self.robots)}"
             raise (PARAMS / "wanted").bad(f"is {self.wanted}", remedy)
         check_name(self.name, PARAMS / "name")
-        # Wrong ones are reported here and now, not by each robot's component.
+        # Report invalid needs at once, rather than from each robot's component.
         self.needs(self.robots[0])
 
 
 class TreeComponent(Component):
-    """A component that performs a tree of behaviors, `root`, and checkpoints it. Their status is published;
-    each new one and each alert is printed, for `zscout component logs`."""
+    """A component that performs and checkpoints a tree of behaviors, `root`. It publishes their status, and prints each
+    change and each alert for `zscout component logs`."""
 
     root: Behavior
     speed: float
@@ -116,7 +115,7 @@ class TreeComponent(Component):
 
 
 class StatusPrinter:
-    """Prints the status of behaviors, without what changes with every picture of a robot."""
+    """Prints each change of a behavior's status, and each alert; changes of numbers in a robot's status don't count."""
 
     def __init__(self) -> None:
         self._last: dict[str, tuple[str, str]] = {}
@@ -132,7 +131,7 @@ class StatusPrinter:
 
 
 class PlaceRobotComponent(TreeComponent):
-    """Hides one robot in the dark and has it watch for motion."""
+    """Hides one robot in the dark, where it watches for motion."""
 
     def __init__(self, params: dict[str, Any]) -> None:
         wanted = read_params(params, RobotParams)
@@ -143,7 +142,7 @@ class PlaceRobotComponent(TreeComponent):
 
 
 class PlaceSensorNetComponent(TreeComponent):
-    """Has robots hide and watch, each by a component `place_robot` of its own."""
+    """Makes robots hide and watch, each by a `place_robot` component of its own."""
 
     def __init__(self, params: dict[str, Any]) -> None:
         net = read_params(params, NetParams)

@@ -1,4 +1,4 @@
-"""Kinds of components that come with zscout: for trying things out, and for measuring."""
+"""Kinds of components that come with zscout, for trials and measurements."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ T = TypeVar("T", bound=Struct)
 
 PARAMS: Final = Where("")
 SLICE: Final = 0.02
-"""Seconds of a turn of `spin`: in between the event loop has its own."""
+"""Seconds per round of `spin`; the event loop runs between rounds."""
 MEGABYTE: Final = 1_000_000
 PAGE: Final = 4_096
 PAUSE: Final = 0.1
@@ -35,9 +35,9 @@ def read_params(params: dict[str, Any], kind: type[T]) -> T:
 
 class CounterParams(Struct):
     period: Annotated[float, key("Seconds from one count to the next.", 0.001, 3600)] = 1.0
-    rc: Annotated[str | None, key("An RC that it holds, and that echoes each count.")] = None
-    priority: Annotated[float, key("Of its ARC.", -1000, 1000)] = 0.0
-    min_runtime: Annotated[float, key("Of its ARC, in seconds.", 0.001, 1e9)] = 3600.0
+    rc: Annotated[str | None, key("RC that it holds, and that echoes each count.")] = None
+    priority: Annotated[float, key("Priority of its ARC.", -1000, 1000)] = 0.0
+    min_runtime: Annotated[float, key("Minimum runtime of its ARC, in seconds.", 0.001, 1e9)] = 3600.0
 
 
 class Counter(Component):
@@ -83,26 +83,27 @@ class Counter(Component):
 
 
 async def _echo(held: Held, rc: str, number: int) -> None:
-    """Raises CommandRefused, but not where no answer came: an echo may be done twice, and the hold still stands."""
+    """Repeat the command until it is answered: an echo may run twice, and the hold remains valid. Raises
+    CommandRefused."""
     while True:
         try:
             await held.command(rc, {"name": "echo", "value": number})
         except CommandRefused as refused:
             if refused.code != "unknown":
                 raise
-            # Without a link there is no answer at once.
+            # Without a link the command fails immediately.
             await asyncio.sleep(PAUSE)
         else:
             return
 
 
 class SpinParams(Struct):
-    cpu: Annotated[float, key("The share of one core that it wants.", 0, 1)] = 0.5
-    memory: Annotated[float, key("In MB, that it fills.", 0, 1_000_000)] = 0.0
+    cpu: Annotated[float, key("Share of one core that it uses.", 0, 1)] = 0.5
+    memory: Annotated[float, key("Memory that it fills, in MB.", 0, 1_000_000)] = 0.0
 
 
 class Spin(Component):
-    """Computes, and prints how far it is once a second."""
+    """Uses processor time and memory; prints the number of its loops once a second."""
 
     def __init__(self, params: dict[str, Any]) -> None:
         wanted = read_params(params, SpinParams)
@@ -123,7 +124,7 @@ class Spin(Component):
                 said = now
                 print(f"{self.loops} loops")  # noqa: T201 - its output
             await context.safe_point()
-            # What it was not given is not made up for.
+            # Don't catch up on rounds that the scheduler delayed.
             due = max(due, now)
             await asyncio.sleep(due - now)
 
