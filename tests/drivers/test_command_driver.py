@@ -94,7 +94,7 @@ def put(file: str, text: str = "") -> None:
 def _quick(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """A folder of its own, and a second try that does not take long; nothing is left behind."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(command_driver, "AGAIN", (0.05, 0.1))
+    monkeypatch.setattr(command_driver, "RETRY_PAUSES_S", (0.05, 0.1))
     monkeypatch.setattr(command_driver, "OPENING", HANG)
     yield
     asyncio.run(until(lambda: not any(map(alive, told("pids")))))  # who was killed may take a moment to go
@@ -181,7 +181,7 @@ async def test_a_start_that_fails_loses_the_device_with_its_last_line_until_it_w
     async with play(start="echo first; printf 'no such\\033[2J power\\n\\n'; exit 3", safe=TELL) as (driver, rc):
         await driver.begin(holder(1))
         await rc.until("start ended with exit code 3: no such [2J power")
-        await driver._look()
+        await driver._check()
         assert "ok" not in rc.said
         await over(driver)
         await rc.until("ok")
@@ -190,7 +190,7 @@ async def test_a_start_that_fails_loses_the_device_with_its_last_line_until_it_w
 async def test_a_start_that_fails_again_and_again_is_tried_ever_more_slowly_and_says_so(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(command_driver, "AGAIN", (0.05, 0.3))
+    monkeypatch.setattr(command_driver, "RETRY_PAUSES_S", (0.05, 0.3))
     clock = asyncio.get_running_loop().time
     # That its health is good again at once makes no difference.
     async with play(start="exit 3", health="true", safe="true", every=0.01) as (driver, rc):
@@ -271,7 +271,7 @@ async def test_of_what_is_written_the_end_is_kept() -> None:
     reader.feed_eof()
     tail = command_driver.OutputTail(reader)
     await tail.drain()
-    assert (tail.said, len(tail._kept)) == (": last", command_driver.KEPT_OUTPUT)
+    assert (tail.last_line, len(tail._kept)) == (": last", command_driver.KEPT_OUTPUT)
 
 
 async def test_a_program_that_is_not_there_is_the_reason() -> None:

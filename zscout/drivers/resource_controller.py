@@ -498,7 +498,7 @@ class ResourceController:
                 try:
                     await self._last_holder.note(direct=True)
                 except OSError as error:
-                    why = f"{self.name} can't note its direct hold on disk ({error}); check the state folder of its node"
+                    why = f"{self.name} can't note its direct hold ({error}); check the state folder of its node"
                     raise Refused("failed", why) from None
             self._raise_refusal(query)
             assert grant is not None  # noqa: S101 - commands without a grant do not come here

@@ -1,13 +1,13 @@
-"""What waits for a radio's line, and in which order it goes out. Pure: times are whole ns, passed in.
+"""The packets that wait for a radio's line, and their order. Pure: times are whole ns, passed in.
 
-First halts and stops, at once; then repeats, as far as the reserve reaches; then drive and camera packets,
-each holder's through its token bucket (`airtime`), first come first served. A drive packet that waits is
-replaced by the holder's next one for the same robot: the newest command is the true one.
+Halts and stops go first, at once; then repeats, within the reserve; then drive and camera packets, first come first
+served, each holder's through its token bucket (`airtime`). A newer drive packet of a holder replaces its waiting drive
+packet for the same robot.
 
-Stop, camera and halt packets go out several times, since nobody acknowledges. A repeat has the number of its original,
-so that the robot obeys once. Where something else went to the robot in between, it gets a number of its own: it then
-repeats what still applies. What a newer packet has overtaken is not repeated: after a drive command nothing of a halt
-is left but "transmitter off"."""
+Stop, camera and halt packets are sent several times, because robots acknowledge nothing. A repeat has the number of its
+original, and the robot obeys once. If another packet went to the robot in between, the repeat gets a new number.
+The parts of a packet that a newer packet overrides are not repeated: after a drive command, only "transmitter off"
+remains of a halt."""
 
 from __future__ import annotations
 
@@ -26,17 +26,17 @@ from zscout.mesh import Refused
 from zscout.types import SECOND, Grant, Ns, Place
 
 MAX_WAITING: Final = 64
-"""Packets of one holder that wait; one replaced by a newer does not count."""
-TIMES: Final = 3
-"""How often a packet that is repeated goes out in all."""
+"""Waiting packets of one holder. A replaced packet does not count."""
+TRANSMISSIONS: Final = 3
+"""How often a repeated packet is sent in all."""
 SPACING: Final[Ns] = SECOND // 20
-"""From one to the next: longer than most bursts of interference, short against a person's patience."""
+"""Between repeats: longer than most bursts of interference, and hardly noticeable for people."""
 
 
 @dataclass(slots=True, eq=False)
 class QueuedPacket:
-    """A holder's packet that has not gone out. `arrived`: when a packet was first asked for here, `given`: when this
-    command was; `entered`: when its bucket let it into the queue."""
+    """A holder's packet that was not sent yet. `arrived`: when the first command for it came; `given`: when the current
+    command came, which may have replaced the first; `entered`: when its bucket admitted it to the queue."""
 
     place: Place
     grant: Grant
@@ -47,7 +47,7 @@ class QueuedPacket:
 
     @property
     def ready(self) -> Fraction:
-        """From when on it could have gone out."""
+        """The earliest time at which it could have been sent."""
         return max(self.entered, Fraction(self.given))
 
     @property
@@ -57,9 +57,8 @@ class QueuedPacket:
 
 @dataclass(frozen=True, slots=True)
 class OutgoingPacket:
-    """A packet to be written now. `sent_by`: when the line has carried it; `entered`: when it stood in the
-    queue, its bucket passed; of a repeat, when it was due. `until`: later it is not to be written; a stop or a halt
-    always is."""
+    """A packet to write now. `entered`: when its bucket admitted it to the queue, or when a repeat was due. `sent_by`:
+    when the line has carried it. `until`: do not write it later; None for stops and halts."""
 
     packet: Packet
     entered: Fraction
@@ -70,7 +69,7 @@ class OutgoingPacket:
 
 @dataclass(slots=True)
 class _Repeat:
-    """A packet that goes out `left` times more, next at `due`."""
+    """A packet to send `left` more times, next at `due`."""
 
     packet: Packet
     left: int
@@ -78,7 +77,7 @@ class _Repeat:
 
 
 class _Robot:
-    """What was sent to one robot: its numbers, and what of it is to be repeated."""
+    """The packet numbers and pending repeats of one robot."""
 
     def __init__(self, first_number: int) -> None:
         self._next = first_number
@@ -87,22 +86,21 @@ class _Robot:
         self.repeats: list[_Repeat] = []
 
     def number(self) -> int:
-        """The number for the next packet that is no repeat."""
+        """Return a new number, for a packet that is not a repeat."""
         self._next, number = (self._next + 1) % 256, self._next
         return number
 
     def sent(self, packet: Packet, now: Ns) -> None:
-        """`packet`, no repeat, went out: what it overtakes is not repeated."""
+        """Note a sent `packet` that is not a repeat: cancel the repeats that it overrides."""
         self.repeats = [kept for repeat in self.repeats if (kept := _remainder(repeat, packet)) is not None]
         if not isinstance(packet, DrivePacket):
-            self.repeats.append(_Repeat(packet, TIMES - 1, now + SPACING))
+            self.repeats.append(_Repeat(packet, TRANSMISSIONS - 1, now + SPACING))
         self._last = packet
         self._count += 1
 
     def repeat(self, repeat: _Repeat, now: Ns) -> Packet:
-        """The packet that goes out now for `repeat`."""
-        # The very first number may by chance be the last that an earlier radio used: the robot then ignores
-        # it, and must be sent another.
+        """Return the packet to send now for `repeat`."""
+        # The robot may have ignored the very first number, if an earlier radio used it last: repeat with another.
         if repeat.packet is not self._last or self._count == 1:
             repeat.packet = replace(repeat.packet, number=self.number())
         self._last = repeat.packet
@@ -115,7 +113,7 @@ class _Robot:
 
 
 def _remainder(repeat: _Repeat, newer: Packet) -> _Repeat | None:
-    """What of `repeat` still applies once `newer` was sent."""
+    """The part of `repeat` that still applies after `newer`, if any."""
     match repeat.packet, newer:
         case (_, HaltPacket()) | (StopPacket(), DrivePacket() | StopPacket()) | (CameraPacket(), CameraPacket()):
             return None
@@ -127,7 +125,7 @@ def _remainder(repeat: _Repeat, newer: Packet) -> _Repeat | None:
 
 
 class _HolderQueue:
-    """A holder: its bucket, what waits for it, and the robots that it has made do something."""
+    """The bucket and waiting packets of a holder, and the robots that it has commanded."""
 
     def __init__(self, share: Share, now: Ns, *, full: bool) -> None:
         self.share = share
@@ -137,13 +135,13 @@ class _HolderQueue:
         self.robots: set[int] = set()
 
     def enters_at(self) -> Fraction | None:
-        """When what waits first may enter the queue."""
+        """When the first waiting packet may enter the queue, or None."""
         if self.bucket is None or not self.waiting:
             return None
         return max(Fraction(self.waiting[0].arrived), self.bucket.ready(self.waiting[0].size))
 
     def enter(self, now: Ns) -> Iterator[QueuedPacket]:
-        """What enters the queue up to now."""
+        """Yield the packets that enter the queue up to now."""
         while self.bucket is not None and (at := self.enters_at()) is not None and at <= now:
             first = self.waiting.popleft()
             self.bucket.take(first.size, at)
@@ -152,13 +150,13 @@ class _HolderQueue:
 
 
 class TransmitQueue:
-    """All that waits for one line of `rate` bytes a second. What could have gone out more than `stale` ago and did not,
-    as the line was not there or this process stood still, is dropped: only stops and halts go out however late."""
+    """The queue of a line with `rate` bytes a second. A packet that could have been sent more than `stale` ago is
+    dropped, after the line was down or this process stalled. Only stops and halts are sent however late."""
 
     def __init__(self, rate: Fraction, *, first_number: int = 0, stale: Ns = SECOND) -> None:
         self._ns_per_byte, self._stale = SECOND / rate, stale
         self._ahead = MAX_PACKET * self._ns_per_byte
-        """How much earlier than the line is free the next packet is written: one waits in the kernel."""
+        """How long before the line is free the next packet is written, so that a packet waits in the kernel."""
         self._free_at = Fraction(0)
         self.members: dict[Place, _HolderQueue] = {}
         self._queue: deque[QueuedPacket] = deque()
@@ -166,26 +164,26 @@ class TransmitQueue:
         self._robots: defaultdict[int, _Robot] = defaultdict(lambda: _Robot(first_number))
         self._reserve = Bucket(Fraction(urgent_burst(0)), rate * RESERVE, 0)
         self.replaced = 0
-        """Drive and camera packets that a newer command made void before they went out."""
+        """Unsent drive and camera packets that a newer command made void."""
         self.dropped = 0
-        """Packets whose hold was over, or that were stale, before they went out."""
+        """Unsent packets that became stale, or whose hold ended."""
 
     # Holders
 
     def join(self, place: Place, share: Share, now: Ns) -> None:
-        """A holder begins. On a busy line it earns its first packet, so that the bound holds for all."""
+        """A holder begins. On a busy line its bucket starts empty, so that the delay bound holds for all."""
         if place not in self.members:
             self.members[place] = _HolderQueue(share, now, full=not self._queue and not self._urgent)
             self._reserve.size = Fraction(urgent_burst(len(self.members)))
 
     def pass_on(self, before: Place, after: Place, share: Share, now: Ns) -> None:
-        """What a holder made robots do goes on under another one; what waits for the first is dropped."""
+        """The hold `before` continues as `after`, with its robots. Its waiting packets are dropped."""
         robots = self.leave(before) if before != after else set()
         self.join(after, share, now)
         self.members[after].robots |= robots
 
     def leave(self, place: Place) -> set[int]:
-        """A holder is gone, and what waits for it. Returns the robots that it made do something."""
+        """Remove a holder and its waiting packets. Return the robots that it commanded."""
         if place not in self.members:
             return set()
         self.dropped += self._remove(lambda waiting: waiting.place == place)
@@ -193,12 +191,12 @@ class TransmitQueue:
         self._reserve.size = Fraction(urgent_burst(len(self.members)))
         return member.robots
 
-    # What is to be sent
+    # Adding packets
 
     def offer(self, place: Place, grant: Grant, command: RadioDrive | RadioCamera, now: Ns) -> Ns:
-        """A drive or camera packet of a holder that has joined. Returns in about how many ns it is through.
+        """Queue a drive or camera packet of a holder that has joined. Return about how many ns remain until it is sent.
 
-        Raises Refused where too much of the holder waits, or its share has no room for such a packet."""
+        Raises Refused if too many packets of the holder wait, or if its share has no room for this packet."""
         member = self.members[place]
         waiting = QueuedPacket(place, grant, command, now, now)
         if member.bucket is None:
@@ -208,7 +206,7 @@ class TransmitQueue:
             raise Refused("bad_command", f"this packet has {sizes}; request packet_size = {MAX_PACKET}")
         self._release(now)
         if isinstance(command, RadioDrive):
-            # Driven under a newer hold: the end of an older one that is learned of late halts it no more.
+            # The robot is driven under a newer hold now: a late end of an older hold must not halt it.
             for other in self.members.values():
                 other.robots.discard(command.robot)
         member.robots.add(command.robot)
@@ -226,36 +224,36 @@ class TransmitQueue:
             self._release(now)
         if waiting in self._queue:
             up_to_it = islice(self._queue, self._queue.index(waiting) + 1)
-            return self._carried(len(self._urgent) * OVERHEAD + sum(queued.size for queued in up_to_it), now)
+            return self._time_for(len(self._urgent) * OVERHEAD + sum(queued.size for queued in up_to_it), now)
         begins = max(member.bucket.ready(waiting.size), self._free_at, Fraction(now))
         return round(begins - now + waiting.size * self._ns_per_byte)
 
     def send_urgent(self, robot: int, kind: type[StopPacket] | type[HaltPacket], now: Ns) -> Ns:
-        """A stop or a halt, ahead of all that waits. Drive packets that wait for this robot are void, with a
-        halt camera packets too. Returns in about how many ns it is through."""
+        """Queue a stop or a halt ahead of all waiting packets. It makes waiting drive packets for this robot void; a
+        halt also camera packets. Return about how many ns remain until it is sent."""
         void = (RadioDrive,) if kind is StopPacket else (RadioDrive, RadioCamera)
-        self.replaced += self._remove(lambda one: one.command.robot == robot and isinstance(one.command, void))
+        self.replaced += self._remove(lambda packet: packet.command.robot == robot and isinstance(packet.command, void))
         first, since = self._urgent.get(robot, (kind, now))
         self._urgent[robot] = (HaltPacket if HaltPacket in (first, kind) else StopPacket, since)
-        return self._carried((list(self._urgent).index(robot) + 1) * OVERHEAD, now)
+        return self._time_for((list(self._urgent).index(robot) + 1) * OVERHEAD, now)
 
     def _remove(self, gone: Callable[[QueuedPacket], bool]) -> int:
-        """Takes out what is `gone` of all that waits; returns how much that was."""
+        """Remove the waiting packets for which `gone` is true. Return their number."""
         before = self.waiting
         self._queue = deque(waiting for waiting in self._queue if not gone(waiting))
         for member in self.members.values():
             member.waiting = deque(waiting for waiting in member.waiting if not gone(waiting))
         return before - self.waiting
 
-    def _carried(self, size: int, now: Ns) -> Ns:
-        """In how many ns `size` bytes more are through."""
+    def _time_for(self, size: int, now: Ns) -> Ns:
+        """The ns until `size` more bytes are sent."""
         return round(max(self._free_at - now, Fraction(0)) + size * self._ns_per_byte)
 
-    # Going out
+    # Sending packets
 
     def next(self, now: Ns, in_force: Callable[[Grant], bool]) -> OutgoingPacket | None:
-        """The packet to be written now, if there is one and the line has room. `in_force` is whether the
-        hold behind a packet is still in force: that is what counts when it goes out."""
+        """Return the packet to write now, if there is one and the line has room. `in_force` returns True if a hold is
+        still in force, without which its packets are dropped."""
         if self._free_at - now > self._ahead:
             return None
         self._release(now)
@@ -282,14 +280,14 @@ class TransmitQueue:
             outgoing = self._transmit(packet, waiting.entered, now)
             return replace(outgoing, until=math.ceil(waiting.ready) + self._stale)
         for member in self.members.values():
-            # Nothing waits: whoever joined while something did may have its packet now.
+            # Nothing waits: holders that joined while the line was busy may send their first packet now.
             if member.earning and member.bucket is not None:
                 member.earning = False
                 member.bucket.fill(now)
         return None
 
     def wake(self, now: Ns) -> Ns | None:
-        """When to call `next` again; None: not before something else happens."""
+        """When to call `next` again; None: only after another event."""
         times = [Fraction(now)] if self._urgent or self._queue else []
         times += [self._may_repeat(repeat) for _, repeat in self._repeats()]
         times += [at for member in self.members.values() if (at := member.enters_at()) is not None]
@@ -297,27 +295,27 @@ class TransmitQueue:
 
     @property
     def urgent(self) -> int:
-        """Halts and stops that have not gone out once."""
+        """Number of unsent halts and stops."""
         return len(self._urgent)
 
     @property
     def waiting(self) -> int:
-        """Drive and camera packets that have not gone out."""
+        """Number of unsent drive and camera packets."""
         return len(self._queue) + sum(len(member.waiting) for member in self.members.values())
 
     def _release(self, now: Ns) -> None:
-        """Lets into the queue what the buckets let through up to now, in the order of its times."""
+        """Move the packets that the buckets admit up to now into the queue, in the order of their times."""
         entering = [waiting for member in self.members.values() for waiting in member.enter(now)]
         self._queue.extend(sorted(entering, key=lambda waiting: waiting.entered))
 
     def _repeats(self) -> Iterator[tuple[_Robot, _Repeat]]:
-        """What is to be repeated next of each robot."""
+        """Yield the next repeat of each robot."""
         for robot in self._robots.values():
             if robot.repeats:
                 yield robot, min(robot.repeats, key=lambda repeat: repeat.due)
 
     def _may_repeat(self, repeat: _Repeat) -> Fraction:
-        """When a repeat may go out: where it is due, and the reserve has room for it."""
+        """When a repeat may be sent: it is due, and the reserve has room for it."""
         return max(Fraction(repeat.due), self._reserve.ready(repeat.packet.size))
 
     def _transmit(self, packet: Packet, entered: Fraction, now: Ns, *, repeat: bool = False) -> OutgoingPacket:
