@@ -406,9 +406,9 @@ async def test_an_rc_that_an_rcm_and_the_mesh_contradict_joins_the_mesh_anew(
                 await answer(client, grant(99), ttl=0.1)
                 await asyncio.sleep(0.5)
             assert (mesh._transport.id() != before) == (sign is not None)
-    said = [record.message for record in caplog.records if "joins the mesh anew" in record.message]
+    said = [record.message for record in caplog.records if "reopening the mesh session" in record.message]
     told = sign and sign.partition(";")[0]
-    assert said == ([f"robot/x: {told}: this process joins the mesh anew"] if sign is not None else [])
+    assert said == ([f"robot/x: {told}: reopening the mesh session"] if sign is not None else [])
 
 
 # The queue alone

@@ -48,7 +48,7 @@ async def test_the_next_in_the_queue_follows_a_holder_killed_with_9(lab: Lab, ba
     assert min(took) > 0
     # A leader that stood still itself leaves who is gone a lease to come back.
     late = sum(seconds >= PATIENT for seconds in took)
-    assert late <= lab.log("a").count("stood still"), "it was noticed by the lease, not by the death"
+    assert late <= lab.log("a").count("process stalled"), "it was noticed by the lease, not by the death"
 
 
 async def _queued(lab: Lab, name: str) -> HolderProcess:

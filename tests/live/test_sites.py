@@ -88,7 +88,7 @@ async def test_the_next_in_the_other_site_follows_a_holder_that_was_killed(tmp_p
             # gone a lease to come back.
             took = await following.enters() - killed
             leaders = [(tmp_path / f"{host}.log").read_text() for host in ("a1", "b1")]
-            assert took < PATIENT * SECOND or any("stood still" in log for log in leaders)
+            assert took < PATIENT * SECOND or any("process stalled" in log for log in leaders)
             await following.gives_back()
 
 

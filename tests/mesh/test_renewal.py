@@ -150,7 +150,7 @@ async def test_a_link_that_comes_back_without_its_token_is_noticed_and_left(capl
         await until(lambda: len(seen) == 4)
         for mesh in (a, b):
             await mesh.close()
-    assert [record.message.partition(":")[2] for record in caplog.records] == [" this process joins the mesh anew"] * 2
+    assert [record.message.partition(":")[2] for record in caplog.records] == [" reopening the mesh session"] * 2
 
 
 @pytest.mark.parametrize("shows_another", [True, False])

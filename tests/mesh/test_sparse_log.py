@@ -26,7 +26,7 @@ def test_one_line_about_each_key_in_a_while_and_how_many_were_left_out(caplog: p
         sparse.warning("a", "%s is odd", "a")
         if second == 5:
             sparse.warning("b", "%s is odd", "b")
-    more = "a is odd (9 more since the last time)"
+    more = "a is odd (9 more since the last warning)"
     assert [record.getMessage() for record in caplog.records] == ["a is odd", "b is odd", more, more]
 
 
@@ -35,12 +35,12 @@ def test_who_takes_ever_new_keys_fills_neither_log_nor_memory(caplog: pytest.Log
     sparse = SparseLog(log, lambda: now)
     for number in range(1_000):
         sparse.warning(f"{number}" + "x" * 100_000, "odd")
-    assert (len(caplog.records), len(sparse._said)) == (MAX_KEYS + 1, MAX_KEYS + 1)
-    assert max(len(key) for _, key in sparse._said) <= 200
+    assert (len(caplog.records), len(sparse._logged)) == (MAX_KEYS + 1, MAX_KEYS + 1)
+    assert max(len(key) for _, key in sparse._logged) <= 200
     # Those that are long silent make room.
     now = 100 * SECOND
     sparse.warning("new", "odd")
-    assert list(sparse._said) == [("odd", "new")]
+    assert list(sparse._logged) == [("odd", "new")]
 
 
 async def test_malformed_answers_and_publications_and_bad_names_are_logged_so(caplog: pytest.LogCaptureFixture) -> None:
@@ -66,4 +66,4 @@ async def test_malformed_answers_and_publications_and_bad_names_are_logged_so(ca
     await until(lambda: len(heard) == 50)
     watched.close()
     starts = [" ".join(record.getMessage().split()[:3]) for record in caplog.records]
-    assert sorted(starts) == ["a reply on", "ignored a liveliness", "ignored a publication", "ignored what came"]
+    assert sorted(starts) == ["a reply on", "ignored a liveliness", "ignored a message", "ignored a publication"]

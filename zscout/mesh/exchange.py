@@ -1,4 +1,4 @@
-"""Queries with their replies, publishers, and declarations of a process on the mesh."""
+"""Queries with their replies, publishers, and other declarations of a process on the mesh."""
 
 from __future__ import annotations
 
@@ -44,19 +44,19 @@ class Reply(Generic[R]):
     arrived: Ns = 0
 
 
-def naming_versions(reply: Reply[R] | None, who: str) -> Reply[R] | None:
-    """The same reply; a refusal that a version difference may explain names both versions."""
+def naming_versions(reply: Reply[R] | None, server: str) -> Reply[R] | None:
+    """Add both versions to a refusal that a version difference may explain; return other replies unchanged."""
     problem = reply.problem if reply is not None else None
     if reply is None or problem is None or problem.code not in NOT_UNDERSTOOD or problem.version == VERSION:
         return reply
-    versions = f"{who} is {version_words(problem.version)}, this is {VERSION}"
+    versions = f"{server} is {version_words(problem.version)}, this is {VERSION}"
     words = f"{problem.message} ({versions}: upgrade the older one if it does not know this)"
     return replace(reply, problem=structs.replace(problem, message=words))
 
 
 def refuse(query: TransportQuery, problem: Problem) -> None:
-    told = structs.replace(problem, version=VERSION) if problem.code in NOT_UNDERSTOOD else problem
-    query.reply_error(messages.encode(told), Problem)
+    problem = structs.replace(problem, version=VERSION) if problem.code in NOT_UNDERSTOOD else problem
+    query.reply_error(messages.encode(problem), Problem)
 
 
 @dataclass(slots=True, eq=False)
@@ -80,65 +80,67 @@ class Tally:
 
 @dataclass(slots=True, eq=False)
 class Answered:
-    said: msgspec.Struct | None = None
+    """The answer to one command, shared by its repetitions."""
+
+    answer: msgspec.Struct | None = None
     waiting: list[IncomingQuery[Any]] = field(default_factory=list)
 
     def join(self, query: IncomingQuery[Any]) -> None:
-        """Answer `query` alike, now or once there is an answer."""
-        if self.said is None:
+        """Give `query` the same answer, now or once there is one."""
+        if self.answer is None:
             self.waiting.append(query)
         else:
-            query.end(self.said)
+            query.end(self.answer)
 
-    def tell(self, said: msgspec.Struct) -> None:
-        self.said = said
+    def settle(self, answer: msgspec.Struct) -> None:
+        self.answer = answer
         while self.waiting:
-            self.waiting.pop().end(said)
+            self.waiting.pop().end(answer)
 
 
 @dataclass(slots=True, eq=False)
 class IncomingQuery(Generic[R]):
-    """A query that arrived: answer it once, now or later. Its sender takes no answer as "unknown"."""
+    """A query that arrived: answer it once, now or later. Unanswered, its outcome is unknown to the sender."""
 
     _query: TransportQuery | None
     key: str
     _reply_key: str
     message: R
-    arrived: Ns  # when it left the network, by `Mesh.now`
+    arrived: Ns  # time of arrival by `Mesh.now`, before any wait in the inbox
     outcome: Answered | None = None
     tally: Tally | None = None
     over: Callable[[], None] | None = None
-    """Called once it is answered or dropped."""
+    """Called when the query is answered or dropped."""
 
     def answer(self, message: msgspec.Struct, encoded: bytes | None = None) -> None:
-        """Answer with `message`; `encoded`: the same, if it is known."""
+        """Answer with `message`; `encoded` is its encoding, if the caller has it."""
         self.end(message, encoded)
 
     def refuse(self, problem: Problem) -> None:
         self.end(problem)
 
     def drop(self) -> None:
-        """Leave it unanswered: its sender does not wait for the whole timeout."""
+        """End the query without an answer, so that its sender need not wait for the whole timeout."""
         if (query := self._taken()) is not None:
             query.drop()
 
-    def end(self, said: msgspec.Struct, encoded: bytes | None = None) -> None:
+    def end(self, answer: msgspec.Struct, encoded: bytes | None = None) -> None:
         if (query := self._taken()) is None:
             return
-        if isinstance(said, Problem):
-            refuse(query, said)
+        if isinstance(answer, Problem):
+            refuse(query, answer)
         else:
-            query.reply(self._reply_key, encoded or messages.encode(said), type(said))
+            query.reply(self._reply_key, encoded or messages.encode(answer), type(answer))
         if self.outcome is not None:
-            self.outcome.tell(said)
+            self.outcome.settle(answer)
         if self.tally is not None:
-            if isinstance(said, Problem):
-                self.tally.refuse(said.code)
+            if isinstance(answer, Problem):
+                self.tally.refuse(answer.code)
             else:
                 self.tally.answered += 1
 
     def _taken(self) -> TransportQuery | None:
-        """The query, once."""
+        """Return the query at the first call, None later."""
         query, self._query = self._query, None
         if query is not None and self.over is not None:
             self.over()
@@ -158,18 +160,19 @@ class Publisher:
 class Backlog:
     pending: int = 0
     missed: int = 0
-    closed: bool = False  # items that still wait are dropped. Subscriptions that share a backlog do not check this.
+    closed: bool = False  # waiting items are dropped; subscriptions that share a backlog do not check this
     depth: int = QUEUE_DEPTH
 
 
 class HostShares:
-    """Queries per host, so that no host takes all the room; `most` of all hosts. Counted on any thread."""
+    """Counts queries: at most `share` of each host, so that no host takes all the room, and `most` of all hosts
+    together. Used on any thread."""
 
     def __init__(self, share: int, most: int | None = None) -> None:
         self._share, self._most, self._lock, self._counts = share, most, threading.Lock(), Counter[str]()
 
     def enter(self, host: str) -> bool:
-        """`host` is empty where none is named."""
+        """Return False if there is no room. `host` is empty if the key names none: then only `most` applies."""
         with self._lock:
             if host and self._counts[host] >= self._share:
                 return False
@@ -186,14 +189,14 @@ class HostShares:
 
 
 class LatestByKey:
-    """Publications that wait, by key: at most `most` of one key, of which the last is replaced by what comes after it,
-    so that no publisher takes all the time. None: any number. Used on any thread."""
+    """Waiting publications by key, at most `most` of each (None: any number): beyond that a new publication replaces
+    the last one, so that no publisher takes all the time. Used on any thread."""
 
     def __init__(self, most: int | None) -> None:
         self._most, self._lock, self._kept = most, threading.Lock(), dict[str, deque[bytes]]()
 
     def put(self, key: str, payload: bytes) -> bool:
-        """Return False if it took the place of one that waits."""
+        """Return False if `payload` replaced a waiting publication."""
         with self._lock:
             kept = self._kept.setdefault(key, deque())
             if self._most is not None and len(kept) >= self._most:
@@ -206,7 +209,7 @@ class LatestByKey:
         return self._pop(key, 0)
 
     def withdraw(self, key: str) -> None:
-        """Take back the last."""
+        """Remove the last publication."""
         self._pop(key, -1)
 
     def _pop(self, key: str, at: int) -> bytes:
@@ -237,7 +240,7 @@ class Declaration:
 
 
 class PolledSubscription(Declaration, Generic[S]):
-    """The latest publications on a key, kept outside the event loop until they are taken."""
+    """The latest publications on a key, kept outside the event loop until the caller takes them."""
 
     def __init__(
         self, take: Callable[[], tuple[str, bytes] | None], undeclare: Undeclare, kind: type[S], depth: int
@@ -246,8 +249,8 @@ class PolledSubscription(Declaration, Generic[S]):
         self._take, self._kind, self._depth = take, kind, depth
 
     def each(self) -> Iterator[tuple[str, S]]:
-        """Yield the publications since the last call as (key, message), oldest first. Malformed ones are skipped,
-        unread ones are kept. Ends after `depth` items, as more may arrive meanwhile."""
+        """Yield the publications since the last call as (key, message), oldest first. Malformed ones are
+        skipped, unread ones are kept. Ends after `depth` items, as more may arrive meanwhile."""
         for _ in range(self._depth):
             sample = self._take()
             if sample is None:

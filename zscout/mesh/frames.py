@@ -1,7 +1,7 @@
 """Frames on the mesh: large, many, and only the newest matters.
 
-Unlike with messages, a publisher knows whether there are subscribers, a frame that can't be sent at once is dropped,
-and a slow subscriber misses frames but never the newest."""
+Unlike with messages, a publisher knows whether there are subscribers, it drops a frame that can't be sent at once, and
+a slow subscriber misses frames but never the newest."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ MAX_HEAD = 2_048  # bytes attached to a frame
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """A picture as it came; a notebook shows it."""
+    """A picture as published; a notebook displays it."""
 
     key: str
     head: FrameHead
-    """`number` counts pictures from when the source was first opened, `time` is in seconds by a clock of the
-    framegrabber's own, `grant` is the hold under which it was taken."""
+    """`number` counts pictures since the source was first opened, `time` is in seconds on the framegrabber's own clock,
+    `grant` is the hold under which the picture was taken."""
     jpeg: bytes
     arrived: Ns
     """On this host's clock."""
@@ -50,7 +50,7 @@ class FramePublisher:
     def __init__(self, publisher: TransportPublisher, deliver: Callable[..., None]) -> None:
         self._publisher, self._deliver = publisher, deliver
         self.close = publisher.undeclare
-        self.watched = False  # True if there are subscribers, as far as is known since `follow`
+        self.watched = False  # True if there are subscribers; valid once `follow` was called
 
     def follow(self, changed: Callable[[bool], None]) -> None:
         """Call `changed(watched)` in the event loop at each change."""
@@ -63,7 +63,7 @@ class FramePublisher:
         update(self._publisher.match(functools.partial(self._deliver, update)))
 
     def put(self, head: FrameHead, jpeg: bytes) -> None:
-        """Publish a frame, or drop it if it had to wait. Raises ValueError for more than MAX_FRAME bytes."""
+        """Publish a frame; drop it if it would have to wait. Raises ValueError for more than MAX_FRAME bytes."""
         if len(jpeg) > MAX_FRAME:
             raise ValueError(f"a frame of {len(jpeg)} bytes is too large; at most {MAX_FRAME} are sent")
         self._publisher.put(jpeg, messages.encode(head))
@@ -74,7 +74,7 @@ class FrameWatch:
 
     def __init__(self, transport: Transport, key: str, deliver: Callable[..., None], now: Callable[[], Ns]) -> None:
         self._deliver, self._now = deliver, now
-        self._strange = SparseLog(log, now)
+        self._malformed_log = SparseLog(log, now)
         self._lock = threading.Lock()
         self._newest: tuple[str, bytes, bytes | None, Ns] | None = None
         self._arrived = asyncio.Event()
@@ -92,7 +92,7 @@ class FrameWatch:
             self._deliver(self._arrived.set)
 
     def take(self) -> Frame | None:
-        """The newest frame, unless it was taken already."""
+        """Return the newest frame, or None if it was taken already."""
         with self._lock:
             newest, self._newest = self._newest, None
         self._arrived.clear()
@@ -107,12 +107,12 @@ class FrameWatch:
             head: FrameHead = messages.decode(attachment, FrameHead, MAX_HEAD)
         except Malformed as error:
             self.malformed += 1
-            self._strange.warning(key, "ignored a frame on %.200r: %s", key, error)
+            self._malformed_log.warning(key, "ignored a frame on %.200r: %s", key, error)
             return None
         return Frame(key, head, jpeg, arrived)
 
     async def next(self, timeout: float) -> Frame | None:
-        """The newest frame; None if none came within `timeout` seconds."""
+        """Wait for the newest frame; return None if none arrived within `timeout` seconds."""
         with suppress(TimeoutError):
             async with asyncio.timeout(timeout):
                 while (frame := self.take()) is None:

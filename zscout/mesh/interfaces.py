@@ -1,8 +1,8 @@
 """The network interfaces and addresses of this host, as sessions use them.
 
-Zenoh reads the interfaces once in a process's life (docs/zenoh.md). So each session is given the addresses that exist
-when it is opened, and a process whose host gains one reopens its session. Loopback is always among the interfaces for
-multicast: processes of one host find each other without a network."""
+Zenoh reads the interfaces once in a process's life (docs/zenoh.md). So each session gets the addresses that exist when
+it is opened, and a process reopens its session when its host gains an address. Multicast always includes loopback:
+processes of one host find each other without a network."""
 
 from __future__ import annotations
 
@@ -32,10 +32,10 @@ class HostAddress(NamedTuple):
 
 
 def addresses() -> frozenset[HostAddress]:
-    """All IPv4 and lasting global IPv6 addresses of the interfaces that run, without loopback."""
+    """All IPv4 and permanent global IPv6 addresses of the running interfaces, without loopback."""
     try:
         stats, found = psutil.net_if_stats(), psutil.net_if_addrs()
-    except OSError:  # they can't be read here
+    except OSError:  # interfaces can't be read on this host
         return frozenset()
     flags = {name: stat.flags.split(",") for name, stat in stats.items()}
     v4 = ((name, known.address) for name, several in found.items() for known in several if known.family == 2)
@@ -57,7 +57,8 @@ def _v6() -> Iterable[tuple[str, str]]:
 
 
 def scouting(interface: str, found: Iterable[HostAddress]) -> str:
-    """The addresses for multicast, for `interface` as the files have it: one of each interface, loopback first."""
+    """Addresses for multicast, joined by commas: loopback, then one of each interface that `interface` of the fleet
+    file selects ("auto", or names and addresses)."""
     of: dict[str, str] = {}
     for name, ip, multicast in sorted(found):
         if ":" not in ip and (multicast or interface != "auto"):
@@ -73,7 +74,7 @@ def _ip(of: dict[str, str], name: str) -> str:
 
 
 def listening(endpoints: Sequence[str], found: Iterable[HostAddress]) -> list[str]:
-    """These endpoints with every address in place of "all addresses": those of which Zenoh would not know."""
+    """Replace "all addresses" in endpoints by each address of `found`: Zenoh may not know them all."""
     result = []
     for endpoint in endpoints:
         if (match := _WILDCARD.fullmatch(endpoint)) is None:
@@ -87,7 +88,7 @@ def listening(endpoints: Sequence[str], found: Iterable[HostAddress]) -> list[st
 
 
 def change(before: frozenset[HostAddress], now: frozenset[HostAddress]) -> str:
-    """The difference in words, empty if there is none."""
+    """Describe the difference; empty if there is none."""
     words = [f"{ip} appeared on {name}" for name, ip, _ in sorted(now - before)]
     words += [f"{ip} disappeared from {name}" for name, ip, _ in sorted(before - now)]
     return ", ".join(words)

@@ -1,4 +1,4 @@
-"""Find out about a mesh without joining it: by multicast, and by TLS handshakes.
+"""Diagnose a mesh without joining it: by multicast, and by TLS handshakes.
 
 A host with wrong files or certificate gets no link, but processes answer all multicast, and a handshake shows why a
 certificate is refused."""
@@ -37,10 +37,10 @@ SCOUT: Final = 1.5  # seconds for all processes to answer
 POLL: Final = 0.02
 CONNECT: Final = 1.5
 HANDSHAKE: Final = 2.0
-OBJECTION: Final = 0.3  # seconds for the other side to refuse our certificate: it checks after we have seen its own
+OBJECTION: Final = 0.3  # seconds for the server to refuse our certificate, which it checks after sending its own
 LINK: Final = 0.8
 LIST: Final = 1.0  # seconds for links to a plain mesh, and for its tokens
-MAX_HEARD: Final = 64  # processes called
+MAX_HEARD: Final = 64  # processes listed
 MAX_TOKENS: Final = 10_000
 LOOPBACKS: Final = {"127.0.0.1", "::1"}
 _ALERT: Final = re.compile(r"alert ([a-z ]*[a-z])")
@@ -48,7 +48,7 @@ _ADDRESS: Final = re.compile(r"(tcp|tls)/([^#?]+):(\d+)(?:[?#].*)?")
 
 
 def multicast_problems(config: MeshConfig) -> dict[str, str]:
-    """The interfaces for multicast, each with its problem, empty if a test packet could be sent."""
+    """The interfaces for multicast, each with its problem; empty if a test packet could be sent."""
     host, _, port = config.multicast_address.rpartition(":")
     group = ip_of(host.strip("[]"))
     assert group is not None  # noqa: S101 - the fleet file was checked
@@ -83,7 +83,7 @@ def _multicast_problem(name: str, group: ipaddress.IPv4Address | ipaddress.IPv6A
 
 @dataclass(frozen=True, slots=True)
 class Heard:
-    """A process that answered by multicast, with its listening addresses; `here`: on this host."""
+    """A process that answered by multicast, with its listening addresses; `here` is True if it is on this host."""
 
     zid: str
     addresses: tuple[str, ...]
@@ -104,12 +104,12 @@ async def heard(config: MeshConfig) -> list[Heard]:
                     await asyncio.sleep(POLL)
                 elif not (zid := str(hello.zid)).startswith(MEETING):
                     hosts = {at: match[2].strip("[]") for at in hello.locators if (match := _ADDRESS.match(at))}
-                    # Every host has loopback: by that a process is known, and called, only if it has no other address.
+                    # Every host has loopback: it identifies and reaches a process only if that has no other address.
                     beyond = {at: host for at, host in hosts.items() if host not in LOOPBACKS} or hosts
                     here = bool(set(beyond.values()) & own)
                     addresses = tuple(at for at in (hosts if here else beyond) if "[fe80:" not in at)
                     found[zid] = Heard(zid, addresses, here, str(hello.whatami) == "router")
-    except (zenoh.ZError, OSError, RuntimeError):  # no interface for it, or no room
+    except (zenoh.ZError, OSError, RuntimeError):  # no interface for multicast, or no room for a session
         pass
     return list(found.values())
 
@@ -122,7 +122,8 @@ def _own_addresses() -> set[str]:
 class Called:
     """Result of calling an address. `speaks` is empty without an answer; `problem` gives the reason.
 
-    For TLS: the certificate shown, its CA, whether that is trusted, and the objection to ours, or empty."""
+    For TLS: the server's certificate, its CA, `trusted` for a known CA, and the server's objection to our certificate,
+    empty if it has none."""
 
     address: str
     speaks: Literal["tls", "plain", ""]
@@ -131,14 +132,14 @@ class Called:
     issuer: str = ""
     trusted: bool = False
     objection: str = ""
-    here: bool = False  # without an answer: True for an address of this host
+    here: bool = False  # set only without an answer: True for an address of this host
 
 
 async def call(
     named: Iterable[str], heard: Iterable[str] = (), cas: str = "", own: Certificates | None = None
 ) -> list[Called]:
-    """Call all TCP and TLS addresses at a time, within six seconds, with these CAs (PEM) and this certificate.
-    Addresses `named` in a file are tried by TLS; the others state their protocol."""
+    """Call all TCP and TLS addresses at once, within six seconds, with these CAs (PEM) and this certificate. `named`
+    addresses, from a file, are tried by TLS whatever their prefix; the prefix of `heard` addresses is reliable."""
     tried = dict.fromkeys(heard, False) | dict.fromkeys(named, True)
     matches = [(match, doubted) for at, doubted in tried.items() if (match := _ADDRESS.fullmatch(at))]
     return list(await asyncio.gather(*(_call(match, doubted, cas, own) for match, doubted in matches)))
@@ -160,7 +161,7 @@ async def _call(match: re.Match[str], doubted: bool, cas: str, own: Certificates
     if cas:
         with suppress(ssl.SSLCertVerificationError):
             return _answer(address, await _handshake(at, _trusting(cas, own)), trusted=True)
-    # Taken as its own authority, any certificate can be read.
+    # Trusted as its own CA, any certificate can be read.
     if (shaken := await _handshake(at, _trusting(None))) is not None and shaken.encoded:
         itself = ssl.DER_cert_to_PEM_cert(shaken.encoded)
         with suppress(ssl.SSLCertVerificationError):
@@ -170,13 +171,13 @@ async def _call(match: re.Match[str], doubted: bool, cas: str, own: Certificates
 
 async def _looked_up(host: str, port: int) -> list[tuple[str, int]]:
     """A host's addresses. Raises OSError."""
-    # In a thread that is not awaited at exit: it takes long without a name server.
+    # In a thread that is not joined at exit: the lookup takes long without a name server.
     look_up = functools.partial(socket.getaddrinfo, host, port, type=socket.SOCK_STREAM)
     return [(str(at[0]), port) for *_, at in await asyncio.wrap_future(in_thread("looks up a name", look_up))]
 
 
 async def _reached(found: Iterable[tuple[str, int]]) -> tuple[str, int]:
-    """The first of these that accepts a connection. Raises OSError."""
+    """Return the first address that accepts a connection. Raises OSError."""
     error: OSError | None = None
     for at in found:
         try:
@@ -190,13 +191,13 @@ async def _reached(found: Iterable[tuple[str, int]]) -> tuple[str, int]:
 
 
 class _Shaken(NamedTuple):
-    told: Mapping[str, Any]  # the other side's certificate, if verified
+    details: Mapping[str, Any]  # the server's certificate, if verified
     encoded: bytes
     objection: str
 
 
 async def _handshake(at: tuple[str, int], context: ssl.SSLContext) -> _Shaken | None:
-    """None if it speaks no TLS. Raises SSLCertVerificationError."""
+    """Return None if the server speaks no TLS. Raises SSLCertVerificationError."""
     try:
         async with asyncio.timeout(HANDSHAKE):
             reader, writer = await asyncio.open_connection(*at, ssl=context)
@@ -205,7 +206,7 @@ async def _handshake(at: tuple[str, int], context: ssl.SSLContext) -> _Shaken | 
     except (OSError, TimeoutError):
         return None
     end, objection = writer.get_extra_info("ssl_object"), ""
-    told, encoded = end.getpeercert() or {}, end.getpeercert(binary_form=True) or b""
+    details, encoded = end.getpeercert() or {}, end.getpeercert(binary_form=True) or b""
     try:
         async with asyncio.timeout(OBJECTION):
             await reader.read(1)
@@ -216,11 +217,11 @@ async def _handshake(at: tuple[str, int], context: ssl.SSLContext) -> _Shaken | 
         pass
     finally:
         writer.transport.abort()
-        # The error by which it ended is logged as one that nobody looked at, else.
+        # Otherwise asyncio logs the connection's error as never retrieved.
         with suppress(OSError):
             async with asyncio.timeout(OBJECTION):
                 await writer.wait_closed()
-    return _Shaken(told, encoded, objection)
+    return _Shaken(details, encoded, objection)
 
 
 def _trusting(cas: str | None, own: Certificates | None = None) -> ssl.SSLContext:
@@ -242,20 +243,20 @@ def _answer(address: str, shaken: _Shaken | None, *, trusted: bool) -> Called:
         return Called(address, "plain")
     objection = shaken.objection if trusted else ""
     try:
-        certificate = validity(shaken.told, Where(address))
+        certificate = validity(shaken.details, Where(address))
     except (BadInput, KeyError):
         return Called(address, "tls", objection=objection)
-    issuer = clean(common_name(shaken.told["issuer"]))
+    issuer = clean(common_name(shaken.details["issuer"]))
     return Called(address, "tls", "", certificate, issuer, trusted, objection)
 
 
 def _reason(error: OSError) -> str:
-    """The cause without the address: all addresses of a name failed alike."""
+    """The cause without the address: all addresses of the name failed in the same way."""
     return os.strerror(error.errno) if error.errno and error.errno > 0 else error.strerror or "can't be called"
 
 
 def plain_fleets(addresses: Sequence[str]) -> dict[str, set[str]]:
-    """Fleets on these addresses without TLS: the hosts of each that have a node. Blocks for two seconds at most."""
+    """Fleets found at these addresses without TLS, each with its hosts that have a node. Blocks for at most 2 s."""
     settings: dict[str, object] = {
         "mode": "peer",
         "id": f"{MEETING}{secrets.token_hex(10)}",

@@ -1,10 +1,10 @@
-"""Restore links that were lost or could not be made, at once.
+"""Restore links at once that were lost or could not be made.
 
-Of two peers the one with the greater id makes the link: usually the newer one, as ids increase. After its start Zenoh
-scouts every 8 s only, so a short fault may leave two live processes unlinked that long. Peers linked to a third learn
-of each other from it (gossip), and link. So the process that had made a link probes the other's listener, scouts for
-both addresses, and opens a session linked to both until they have met (docs/zenoh.md). Relays are routers, which
-scouting does not find: `connect` names them."""
+Of two peers the one with the greater id makes the link: usually the newer peer, as ids increase. After its start Zenoh
+scouts only every 8 s, so a short fault may leave two live processes unlinked that long. Two peers that are linked to a
+third learn of each other from it (gossip), and link. So the process that had made a link probes the other's listener,
+scouts for the addresses of both, and opens a temporary session linked to both until they have a link (docs/zenoh.md).
+Relays are routers, which scouting does not find: `connect` names them."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ from zenoh.handlers import Callback
 
 log = logging.getLogger(__name__)
 
-PAUSES: Final = (0.02, 0.1, 0.1, 0.2, 0.2, 0.5, *(1.0,) * 30)  # seconds before each look; then Zenoh alone looks
-TOGETHER: Final = 0.25  # seconds between two losses that mean this process was away: it looks for all peers
-LOOKS_FOR_GREATER: Final = 4  # looks for peers with a greater id; few, as many processes may look at one time
+PAUSES: Final = (0.02, 0.1, 0.1, 0.2, 0.2, 0.5, *(1.0,) * 30)  # seconds before each attempt; then only Zenoh tries
+TOGETHER: Final = 0.25  # two losses within these seconds mean that this process was cut off: it looks for all peers
+LOOKS_FOR_GREATER: Final = 4  # attempts for peers with a greater id; few, as many processes may try at once
 PROBE_TIMEOUT: Final = 0.25
-PROBES_TIMEOUT: Final = 1.0  # seconds for all probes of one look
+PROBES_TIMEOUT: Final = 1.0  # seconds for all probes of one attempt
 SCOUT_TIMEOUT: Final = 0.5
 GREET_TIMEOUT: Final = 0.1
-MEET_TIMEOUT: Final = 0.25  # seconds; an end that has not noticed the loss accepts no second link
+MEET_TIMEOUT: Final = 0.25  # seconds; a peer that has not noticed the loss accepts no second link
 POLL: Final = 0.002
 MEETING: Final = "6d656574"  # prefix of the ids of temporary sessions, whose end is ignored
 _ADDRESS: Final = re.compile(r"^(?:tcp|tls)/(.+):(\d+)(?:[?#].*)?$")
@@ -40,16 +40,16 @@ _ADDRESS: Final = re.compile(r"^(?:tcp|tls)/(.+):(\d+)(?:[?#].*)?$")
 @dataclass(slots=True)
 class _Lost:
     at: float
-    addresses: list[str] = field(default_factory=list)  # where the other ends listen
+    addresses: list[str] = field(default_factory=list)  # on which the peer listens
     looks: int = 0
-    listens: bool | None = None  # not probed again: an unused connection keeps others off a TLS listener for 0.1 s
-    together: bool = False  # True if this peer is looked for though it makes the link
+    listens: bool | None = None  # once True not probed again: an unused connection blocks a TLS listener for 0.1 s
+    together: bool = False  # True if this process looks for the peer though the peer makes the link
 
 
 class Relinking:
-    """Restores the links of one session, in a thread that lives while a link is lost.
+    """Restores the links of one session, in a thread that runs while a link is lost.
 
-    `scouting`: settings for finding peers; `meeting`: for a temporary session with the given addresses alone."""
+    `scouting`: settings for finding peers; `meeting`: for a temporary session with only the given addresses."""
 
     def __init__(
         self, session: zenoh.Session, scouting: zenoh.Config, meeting: Callable[[Sequence[str]], zenoh.Config]
@@ -69,7 +69,7 @@ class Relinking:
         ]
         alone = not self._linked()
         with self._lock:
-            if alone and self._thread is None:  # a link may have come and gone already
+            if alone and self._thread is None:  # a link may have been made and lost already
                 self._begin(greet=True)
 
     def close(self) -> None:
@@ -92,7 +92,7 @@ class Relinking:
         now, peer = time.monotonic(), str(event.link.zid)
         with self._lock:
             if event.kind == zenoh.SampleKind.PUT or self._closed.is_set() or peer.startswith(MEETING):
-                return  # new links are found by a look: they may vanish without another event
+                return  # `_try_all` sees new links: they may vanish without another event
             if peer in self._routers:
                 self._routers.remove(peer)
                 return
@@ -109,10 +109,10 @@ class Relinking:
         self._thread.start()
 
     def _greet(self) -> None:
-        """Look for all peers: none needs a link from here, and others may not know this process."""
+        """Look for all peers at the start: this process may be known to none of them."""
         try:
             found = self._scout(GREET_TIMEOUT)
-        except zenoh.ZError as error:  # no interface is up, not even loopback
+        except zenoh.ZError as error:  # no interface is up, loopback included
             log.debug("looking for peers failed: %s", error)
             return
         with self._lock:
@@ -126,16 +126,16 @@ class Relinking:
             while (pause := self._next()) is not None:
                 self._closed.wait(pause)
                 try:
-                    self._look()
-                except zenoh.ZError as error:  # the next look may do better
+                    self._try_all()
+                except zenoh.ZError as error:  # the next attempt may succeed
                     log.debug("looking for lost links failed: %s", error)
         except Exception:
-            log.exception("lost links are left to Zenoh: looking for them failed")
+            log.exception("restoring lost links failed; only Zenoh retries them")
             with self._lock:
                 self._lost, self._thread = {}, None
 
     def _next(self) -> float | None:
-        """Seconds until the next look; None: no link is lost."""
+        """Seconds until the next attempt; None if no link is lost."""
         with self._lock:
             still = {peer: lost for peer, lost in self._lost.items() if lost.looks < len(PAUSES)}
             self._lost = {} if self._closed.is_set() else still
@@ -144,7 +144,7 @@ class Relinking:
             self._thread = None
             return None
 
-    def _look(self) -> None:
+    def _try_all(self) -> None:
         linked, now = self._linked(), time.monotonic()
         with self._lock:
             # A peer just lost may still be listed as linked.
@@ -161,7 +161,7 @@ class Relinking:
             if link.listens or (link.together and link.looks <= LOOKS_FOR_GREATER):
                 wanted.add(peer)
             elif link.listens is False and time.monotonic() - link.at >= TOGETHER:
-                # Its process ended, or it makes the link itself. Earlier, another loss may still come.
+                # The peer's process ended, or the peer makes the link. Before TOGETHER is over another loss may follow.
                 link.looks = len(PAUSES)
         if wanted and not self._closed.is_set():
             there = self._scout(SCOUT_TIMEOUT, wanted)
@@ -172,7 +172,7 @@ class Relinking:
         return {str(peer) for peer in self._session.info.peers_zid()}
 
     def _scout(self, seconds: float, wanted: Collection[str] = ()) -> dict[str, list[str]]:
-        """Addresses by peer: of all peers, or of `wanted` and this process, as soon as they are found."""
+        """Addresses by peer. With `wanted`, only of these and this process; returns as soon as all are found."""
         found: dict[str, list[str]] = {}
         until = time.monotonic() + seconds
         with zenoh.scout(what="peer", config=self._scouting) as scout:
@@ -198,7 +198,7 @@ class Relinking:
 
 
 def _listens(addresses: Sequence[str]) -> bool | None:
-    """Return True if one of these addresses accepts connections; None: unknown now."""
+    """Return True if one of these addresses accepts connections, None if that is unknown now."""
     listens: bool | None = False
     for address in addresses:
         if (found := _ADDRESS.match(address)) is None:

@@ -1,7 +1,7 @@
 """A session that can be reopened, and the contradictions that demand it.
 
-Zenoh's links can come back without all declarations of the other side (docs/protocol.md). A process that sees such a
-contradiction last opens another session with all its declarations, and closes the first: no caller notices."""
+Zenoh's links can come back without all declarations of the other side (docs/protocol.md). When such a contradiction
+lasts, the process opens another session with all its declarations and closes the first; no caller notices."""
 
 from __future__ import annotations
 
@@ -20,35 +20,35 @@ from zscout.types import SECOND, Ns
 log = logging.getLogger(__name__)
 
 PATIENCE: Final = 2.0  # seconds for which a contradiction must last
-UNHEARD: Final = 0.5  # seconds beyond half a hold lease of an RCM alive yet silent: holds must not lapse
-LASTS: Final = 60.0  # seconds after which a contradiction that is not repeated is forgotten
-OVERLAP: Final = 0.5  # seconds with both sessions open, for others to learn what the new one declares
-MOST_OVERLAPS: Final = 3  # until each peer of the old session was linked to the new one through an overlap
-LINKED: Final = 2.0  # seconds that the new session may take to link to the peers of the old one
+UNHEARD: Final = 0.5  # seconds that a live RCM may be silent beyond half a hold lease: holds must not lapse
+LASTS: Final = 60.0  # seconds after which a contradiction is forgotten unless reported again
+OVERLAP: Final = 0.5  # seconds with both sessions open, for others to learn the declarations of the new one
+MOST_OVERLAPS: Final = 3  # overlaps to wait for each peer of the old session to have a link to the new one
+LINKED: Final = 2.0  # seconds for the new session to link to the peers of the old one
 LOOK_EVERY: Final = 0.02
-SHORTEST, LONGEST = 10.0, 320.0  # seconds between renewals, doubled while they do not help
+SHORTEST, LONGEST = 10.0, 320.0  # seconds between renewals, doubled while a contradiction outlives them
 
 OnToken: TypeAlias = Callable[[str, bool], None]
 Opening: TypeAlias = Callable[[], Awaitable[Transport]]
 
 
 class Suspicions:
-    """Contradictions seen by this process, by subject. One that lasts calls `renew`."""
+    """Contradictions seen by this process, by subject. `renew` is called when a contradiction lasts."""
 
     def __init__(self, now: Callable[[], Ns], renew: Callable[[], object]) -> None:
         self._now, self._renew = now, renew
-        self._since: dict[str, tuple[Ns, Ns]] = {}  # first and last time of each
+        self._since: dict[str, tuple[Ns, Ns]] = {}  # first and last report of each
         self._last: Ns | None = None
         self._pause = SHORTEST
-        self._acted: dict[str, Ns] = {}  # time of the last renewal for each contradiction that is not resolved
+        self._acted: dict[str, Ns] = {}  # last renewal for each unresolved contradiction
 
     @property
     def any(self) -> bool:
-        """Return True if a contradiction is suspected, or not resolved yet."""
+        """True while a contradiction is suspected or unresolved."""
         return bool(self._since or self._acted)
 
     def suspect(self, what: str, *, so: bool = True, patience: float = PATIENCE) -> None:
-        """Report a contradiction (`so`), repeatedly while it lasts, or its end. `patience` is in seconds."""
+        """Report a contradiction repeatedly while it lasts, or its end (`so=False`); `patience` is in seconds."""
         if not so:
             self._since.pop(what, None)
             self._acted.pop(what, None)
@@ -68,18 +68,18 @@ class Suspicions:
             self._pause = SHORTEST if helped or calm else min(LONGEST, 2 * self._pause)
         self._last = self._acted[what] = now
         self._since.clear()
-        log.warning("%s: this process joins the mesh anew", what)
+        log.warning("%s: reopening the mesh session", what)
         self._renew()
 
-    def keep(self, those: Collection[str], prefix: str) -> None:
-        """Drop all contradictions that begin with `prefix`, except `those`."""
+    def keep(self, current: Collection[str], prefix: str) -> None:
+        """Drop all contradictions that begin with `prefix` and are not in `current`."""
         for known in (self._since, self._acted):
-            for what in [what for what in known if what.startswith(prefix) and what not in those]:
+            for what in [what for what in known if what.startswith(prefix) and what not in current]:
                 del known[what]
 
 
 class RenewableTransport(Transport):
-    """`openings` open replacement sessions one after the other; the last one stays."""
+    """A session that can be replaced: `openings` each open a session, in turn, and the last session stays."""
 
     def __init__(self, transport: Transport, openings: Sequence[Opening]) -> None:
         self.current, self._openings = transport, openings
@@ -89,15 +89,15 @@ class RenewableTransport(Transport):
         self._renewing: asyncio.Task[None] | None = None
         self._closed = False
         self.behind = False
-        """The present session has older settings than were to be taken: `renew` was too early, or failed."""
+        """True if the present session lacks the latest settings: a renewal began before they changed, or failed."""
 
     def renew(self) -> None:
-        """Renew, unless a renewal runs. A failure is logged, and keeps the present session."""
+        """Start a renewal, unless one runs. A failure is logged, and keeps the present session."""
         if self._renewing is None and not self._closed:
             self._renewing = asyncio.create_task(self._renew())
 
     def take_settings(self) -> None:
-        """Renew with settings that have changed: again after a renewal that may have begun with older ones."""
+        """Renew with changed settings; repeat a running renewal, which may have begun with older settings."""
         self.behind = True
         self.renew()
 
@@ -116,7 +116,7 @@ class RenewableTransport(Transport):
                     # Declare first, so that no token of this process disappears in between.
                     for declared in self._all():
                         declared.declare(fresh)
-                    # A peer may link to the old one meanwhile: a network has just come, or the peer is renewed, too.
+                    # A peer may meanwhile link to the old one: after a new network, or a renewal of the peer.
                     for _ in range(MOST_OVERLAPS):
                         known = {*fresh.peers(), fresh.id()}
                         await asyncio.sleep(OVERLAP)
@@ -140,8 +140,8 @@ class RenewableTransport(Transport):
             self.renew()
 
     async def _linked(self, old: Transport, fresh: Transport) -> None:
-        """Wait until `fresh` has the peers of `old`, for a while."""
-        # Zenoh reports no links, but listing them costs nothing.
+        """Wait until `fresh` has links to all peers of `old`, at most LINKED seconds."""
+        # Polled: Zenoh reports no new links, and listing them is cheap.
         tries = round(LINKED / LOOK_EVERY)
         while tries and not set(old.peers()) <= {*fresh.peers(), fresh.id()}:
             tries -= 1
@@ -250,7 +250,7 @@ class RenewableTransport(Transport):
 
 
 class _Declared:
-    """One declaration: on the present session, and on the former until that is closed."""
+    """One declaration: on the present session, and on the previous session until that is closed."""
 
     def __init__(self) -> None:
         self._undeclare: list[Undeclare] = []
@@ -323,14 +323,14 @@ class _RenewablePublisher(TransportPublisher):
 
 
 class _TokenView:
-    """The tokens on a key as their watcher knows them: a new session reports differences only."""
+    """Tracks the tokens on a key for a watcher, so that a new session reports only differences."""
 
     def __init__(self, key: str, on_token: OnToken, owns: Callable[[str], bool]) -> None:
         self._key, self._on_token, self._owns = key, on_token, owns
         self._session = 0
         # A token that dies during the iteration may be reported on the same thread.
         self._lock = threading.RLock()
-        self._alive: dict[str, int] = {}  # the last session that showed each token
+        self._alive: dict[str, int] = {}  # number of the last session that reported each token
 
     def declare(self, transport: Transport) -> Undeclare:
         self._session += 1
@@ -338,9 +338,9 @@ class _TokenView:
 
         def on_token(token: str, alive: bool) -> None:
             with self._lock:
-                if session != self._session:  # of the old session, which closes soon
+                if session != self._session:  # reported by the old session, which closes soon
                     return
-                # Zenoh reports a session's own token gone while the same token lives on another session.
+                # Zenoh reports a session's own token as gone while another session still declares the same token.
                 if not alive and self._owns(token):
                     return
                 known = token in self._alive
@@ -357,7 +357,7 @@ class _TokenView:
         return undeclare
 
     def _forget(self, session: int) -> None:
-        """Report tokens that the new session has not shown as gone."""
+        """Report tokens that session number `session` has not reported as gone."""
         with self._lock:
             for token in [token for token, shown in self._alive.items() if shown < session]:
                 del self._alive[token]

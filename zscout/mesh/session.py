@@ -45,31 +45,31 @@ log = logging.getLogger(__name__)
 INBOX_DEPTH = 20_000  # items of all kinds that may wait for the event loop
 BURST = 256  # items handled in a row at most
 BURST_S = 0.02  # seconds after which a burst ends: timers and other services run between bursts
-SHARE = 16  # queries of one host in the common order; its surplus waits until that is empty
+SHARE = 16  # queries of one host in the common queue; its surplus waits until the common queue is empty
 RING_DEPTH = 32
-KEPT_BY_KEY = 16  # publications on one key that wait, where the newest counts: of more, the latest
-MAX_OF_ONE_KEY = 8  # answers to one question, as of the processes of one host: further ones are not read
-LINK_PERIOD = 1.0  # seconds between two checks that each linked session shows its declarations
+KEPT_BY_KEY = 16  # waiting publications on one key if only the newest counts; then the newest replaces the last
+MAX_OF_ONE_KEY = 8  # answers read per key and query, such as from the processes of one host
+LINK_PERIOD = 1.0  # seconds between two checks that each linked session's token is visible
 MAX_SESSIONS = 4_096  # sessions remembered
 FINAL_SLACK = 0.5  # seconds after its timeout at which a query ends without the transport's report
 
 _Subscription: TypeAlias = tuple[Backlog, list[Callable[[str, Any], None]], Undeclare]
-"""Decoded once for all handlers."""
+"""A subscription that decodes once for all its handlers."""
 OnReply: TypeAlias = Callable[[str, bytes, bool], bool]
-"""Takes key, payload, is message; returns True if that is enough."""
+"""Takes key, payload, and True for a message; returns True if no further reply is needed."""
 
 S = TypeVar("S")
 R = TypeVar("R")
 
 
 class Lane(IntEnum):
-    """Which queries wait for which, where there is more than the event loop can do."""
+    """The order in which items are handled when more arrive than the event loop can handle."""
 
     REPORT = 0
     """Tokens, publications, replies and ends of queries: never set aside."""
     ASK = 1
     QUESTION = 2
-    """It changes nothing: set aside behind surplus asks."""
+    """A query that changes nothing: set aside behind surplus asks."""
 
 
 class _Item(NamedTuple):
@@ -84,8 +84,8 @@ class _Item(NamedTuple):
 class Inbox:
     """Carries calls from Zenoh's threads into the event loop, with one wake-up per burst.
 
-    All keep their order, except the surplus of a host: of its queries in one lane the first SHARE wait in the common
-    order, the others until that is empty."""
+    Calls keep their order, except the surplus of a host: of its queries in one lane the first SHARE wait in the common
+    queue, the others until the common queue is empty."""
 
     loop: asyncio.AbstractEventLoop
     items: deque[_Item] = field(default_factory=deque)  # just arrived
@@ -108,8 +108,8 @@ class Inbox:
         return self._put(_Item(state, lane, host, call, args))
 
     def behind(self, lane: Lane, host: str, call: Callable[..., None], *args: Any) -> bool:
-        """Call `call(*args)` behind the surplus of `host`. Return False if it would not wait: there is no surplus, and
-        no ask waits for a question. Raises Refused if too much waits there."""
+        """Call `call(*args)` after the surplus of `host`. Return False, and do nothing, if the call need not wait: the
+        host has no surplus, and for a question nothing else waits. Raises Refused if too many calls wait there."""
         of = lane, host
         if of not in self.surplus and not (lane is Lane.QUESTION and (self.ready or self.items or self.surplus)):
             return False
@@ -121,7 +121,8 @@ class Inbox:
         return True
 
     def deliver(self, call: Callable[..., None], *args: Any) -> None:
-        """Like `offer`, for what must not be lost, such as deaths and ends of queries; their number is bounded."""
+        """Like `offer`, without a limit: for items that must not be lost and whose number is bounded, such as
+        disappeared tokens and ends of queries."""
         if not self.closed:
             self._put(_Item(None, Lane.REPORT, "", call, args))
 
@@ -171,13 +172,13 @@ class Inbox:
 
     def _next(self) -> _Item | None:
         if len(self.items) == 1 and not self.ready and not self.surplus:
-            return self.items.popleft()  # as most do, it comes alone
+            return self.items.popleft()  # the usual case
         while self.items:
             self._sort(self.items.popleft())
         if not self.ready:
             if not self.surplus:
                 return None
-            self._let_in()
+            self._admit_surplus()
         item = self.ready.popleft()
         if item.lane is not Lane.REPORT:
             self.shares[item.lane, item.host] -= 1
@@ -194,8 +195,8 @@ class Inbox:
             self.surplus.setdefault(of, deque()).append(item)
             self.set_aside += 1
 
-    def _let_in(self) -> None:
-        """Let surplus of each host in, asks first."""
+    def _admit_surplus(self) -> None:
+        """Move surplus of each host to the common queue, asks first."""
         self.shares.clear()
         lane = min((lane for lane, _ in self.surplus), default=None)
         for of in [of for of in self.surplus if of[0] is lane]:
@@ -208,13 +209,13 @@ class Inbox:
 
 
 def guarded(call: Callable[..., None], *args: Any) -> None:
-    """Call a handler; log what it raises."""
+    """Call a handler, and log the exception that it raises."""
     try:
         call(*args)
-    except Refused:  # by a supervised handler: it is logged there
+    except Refused:  # by a supervised handler, which has logged the cause
         pass
     except BadName as error:
-        log.warning("ignored what came under a bad name: %s", error)
+        log.warning("ignored a message under a bad name: %s", error)
     except Exception:
         log.exception("a handler failed")
 
@@ -222,7 +223,7 @@ def guarded(call: Callable[..., None], *args: Any) -> None:
 class Mesh:
     """One process's place on the mesh, an async context manager: typed queries, publications, liveliness, and a clock.
 
-    Declare once per purpose, never per request: Zenoh keeps memory for every key that was ever declared."""
+    Declare once per purpose, never per request: Zenoh never frees the memory of a declared key."""
 
     validity: Validity | None = None  # of this process's present certificate; None on a plain mesh
 
@@ -230,7 +231,7 @@ class Mesh:
         self.keys, self.me, self.now = keys, me, now  # `now()`: ns on this host's monotonic clock
         self.suspicions = Suspicions(now, transport.renew)
         self._transport = transport
-        self._strange = SparseLog(log, now)
+        self._malformed_log = SparseLog(log, now)
         self._inbox = Inbox(asyncio.get_running_loop())
         self._shared: dict[tuple[Any, ...], _Subscription] = {}
         self._kept: list[object] = []  # objects that live as long as this mesh
@@ -250,7 +251,7 @@ class Mesh:
         return self._transport.relays()
 
     async def close(self) -> None:
-        """Leave the mesh: tokens die, and no handler is called afterwards. Bounded in time."""
+        """Leave the mesh within a bounded time: tokens disappear, and no handler is called afterwards."""
         self._inbox.close()
         await self._transport.close()
 
@@ -274,9 +275,9 @@ class Mesh:
         enough: Callable[[Reply[R]], bool] | None = None,
         limit: int = messages.MAX_STATE,
     ) -> list[Reply[R]]:
-        """Query all servers of `key`; return the replies that came within `timeout` seconds, or until one is `enough`.
+        """Query all servers of `key`; return the replies of `timeout` seconds, or up to the first that is `enough`.
 
-        Without a reply the query may have been carried out, or not. Raises MeshError if it can't be sent."""
+        Without a reply it is unknown whether the query was carried out. Raises MeshError if it can't be sent."""
         replies: list[Reply[R]] = []
         answers: dict[str, int] = {}
 
@@ -302,7 +303,7 @@ class Mesh:
     def ask_then(
         self, key: str, message: Struct, kind: type[R], then: Callable[[Reply[R] | None], None], *, timeout: float
     ) -> None:
-        """Query, and call `then` once with the first reply or None: cheaper than a task that waits."""
+        """Query, and call `then` once with the first reply or None; cheaper than a waiting task."""
         first: Reply[R] | None = None
 
         def on_reply(of: str, payload: bytes, ok: bool) -> bool:
@@ -314,7 +315,7 @@ class Mesh:
         self._get(key, message, timeout, _Collector(self._inbox, on_reply, lambda: then(first), most))
 
     def _read_reply(self, key: str, payload: bytes, ok: bool, kind: type[R], limit: int) -> Reply[R] | None:
-        """`key` is the answer's, or the question's for a problem without a key."""
+        """Return None for a timeout or a malformed reply. `key` is the query's for a problem, which has no key."""
         now = self.now()
         try:
             if ok:
@@ -323,7 +324,7 @@ class Mesh:
                 return None
             return Reply("", None, messages.decode(payload, Problem), now)
         except Malformed as error:
-            self._strange.warning(key, "a reply on %.200r was malformed: %s", key, error)
+            self._malformed_log.warning(key, "a reply on %.200r was malformed: %s", key, error)
             return None
 
     def _get(self, key: str, message: Struct | None, timeout: float, to: Collector) -> None:
@@ -335,7 +336,7 @@ class Mesh:
     ) -> None:
         """Query, and return when the query ends or `on_reply` returns True."""
         loop = self._inbox.loop
-        done: asyncio.Future[None] = loop.create_future()  # not an Event: this is the way of every request
+        done: asyncio.Future[None] = loop.create_future()  # cheaper than an Event: every request comes by here
 
         def finish() -> None:
             if not done.done():
@@ -361,18 +362,18 @@ class Mesh:
         concerns: Callable[[IncomingQuery[Any]], tuple[Lane, str]] | None = None,
         unanswered: int | None = None,
     ) -> Declaration:
-        """Call `handler` for queries on `key` with a message of `kind`; `tally` counts how they end. `concerns`: the
-        lane that a query turns out to belong in, and the host whose surplus it waits behind (see `Inbox`).
+        """Call `handler` for queries on `key` with a message of `kind`; `tally` counts how they end. `concerns` returns
+        the lane of a decoded query, and the host whose surplus it waits behind (see `Inbox`).
 
-        Refused undecoded: wildcard keys (answered on `key` if that is concrete), and, as `busy`, queries beyond `depth`
-        waiting, or half of it from one host if the key names its sender; so are those beyond `unanswered` that are not
-        answered yet. Bad payloads are `malformed`."""
+        Queries with a wildcard key are refused, unless `key` is concrete: then they are answered on `key`. Refused as
+        `busy`: queries while `depth` others wait, or half of it from one host if the key names the sender; and queries
+        while `unanswered` others have no answer yet. Bad payloads are refused as `malformed`."""
         state = Backlog(depth=depth)
         wild, names_sender = "*" in key, key.endswith("/*/*")
         shares = HostShares(depth // 2)
         open_ = None if unanswered is None else HostShares(unanswered // 2, unanswered)
 
-        def turn_away(query: TransportQuery, code: str, message: str) -> None:
+        def reject(query: TransportQuery, code: str, message: str) -> None:
             if tally is not None:
                 tally.refuse(code)
             refuse(query, Problem(code, message))
@@ -383,27 +384,27 @@ class Mesh:
             if state.closed:
                 query.drop()
             elif host and not shares.enter(host):
-                turn_away(query, "busy", f"too many requests of {host[:MAX_NAME]} are waiting here; ask again")
+                reject(query, "busy", f"too many requests of {host[:MAX_NAME]} are waiting here; ask again")
             elif not self._inbox.offer(state, handle, query, asked, self.now(), host, lane=lane, host=host):
                 if host:
                     shares.leave(host)
-                turn_away(query, "busy", "too many requests are waiting here; ask again")
+                reject(query, "busy", "too many requests are waiting here; ask again")
 
         def handle(query: TransportQuery, asked: str, arrived: Ns, host: str) -> None:
             if host:
                 shares.leave(host)
             if state.closed:
-                # Unless it is dropped now, its sender waits for the whole timeout.
+                # Dropped now, or its sender waits for the whole timeout.
                 query.drop()
                 return
             if wild and "*" in asked:
-                turn_away(query, "bad_key", f"name yourself in the key {key}: no wildcards")
+                reject(query, "bad_key", f"name yourself in the key {key}: no wildcards")
                 return
             payload = query.payload
             try:
                 message = messages.decode(b"{}" if payload is None else payload, kind, limit)
             except Malformed as error:
-                turn_away(query, "malformed", str(error))
+                reject(query, "malformed", str(error))
                 return
             incoming: IncomingQuery[Any] = IncomingQuery(
                 query, asked, asked if wild else key, message, arrived, tally=tally
@@ -436,11 +437,12 @@ class Mesh:
         return Declaration(self._transport.queryable(key, on_query), state)
 
     def publisher(self, key: str, kind: type, *, data: bool = False) -> Publisher:
-        """A publisher for control messages, which block rather than get lost; `data` is dropped, and yields."""
+        """A publisher for control messages, which block rather than get lost, or for `data`, which is dropped rather
+        than queued and has a lower priority."""
         return Publisher(self._transport.publisher(key, kind, Quality.DATA if data else Quality.CONTROL))
 
     def put(self, key: str, message: Struct) -> None:
-        """Publish one control message without a declaration: for keys of which there are many."""
+        """Publish one control message without a declaration: for purposes with many keys."""
         self._transport.put(key, messages.encode(message), type(message))
 
     def subscribe(
@@ -452,8 +454,9 @@ class Mesh:
         depth: int = QUEUE_DEPTH,
         limit: int = messages.MAX_STATE,
     ) -> Declaration:
-        """Call `handler(key, message)` for every publication on `key`. Malformed ones are logged; those beyond `depth`
-        are dropped and counted as missed. Equal subscriptions share one declaration and decoding."""
+        """Call `handler(key, message)` for every publication on `key`. Malformed publications are logged; while
+        `depth` of them wait, further ones are dropped and counted as missed. Equal subscriptions share one declaration
+        and decoding."""
         alike = (key, kind, depth, limit)
         if alike not in self._shared:
             self._shared[alike] = self._subscribe(key, kind, depth, limit)
@@ -475,7 +478,7 @@ class Mesh:
         waiting = LatestByKey(KEPT_BY_KEY if kind in messages.NEWEST_COUNTS else None)
 
         def on_sample(name: str, payload: bytes, _: bytes | None) -> None:
-            # One that is too large waits cut, to be refused.
+            # A payload over the limit is cut, and refused when it is decoded.
             if not waiting.put(name, payload[: most + 1]):
                 state.missed += 1
             elif not self._inbox.offer(state, handle, name):
@@ -489,21 +492,21 @@ class Mesh:
             try:
                 message: S = messages.decode_told(payload, kind, limit)
             except Malformed as error:
-                self._strange.warning(name, "ignored a publication on %.200r: %s", name, error)
+                self._malformed_log.warning(name, "ignored a publication on %.200r: %s", name, error)
                 return
             for handler in tuple(handlers):
-                guarded(self._tell, handler, name, message)
+                guarded(self._call, handler, name, message)
 
         return state, handlers, self._transport.subscriber(key, on_sample)
 
-    def _tell(self, handler: Callable[[str, S], None], name: str, message: S) -> None:
+    def _call(self, handler: Callable[[str, S], None], name: str, message: S) -> None:
         try:
             handler(name, message)
         except BadName as error:
-            self._strange.warning(name, "ignored what came under a bad name: %s", error)
+            self._malformed_log.warning(name, "ignored a message under a bad name: %s", error)
 
     def poll_latest(self, key: str, kind: type[S], *, depth: int = RING_DEPTH) -> PolledSubscription[S]:
-        """Keep the latest `depth` publications on `key` until they are taken, without waking the event loop."""
+        """Keep the latest `depth` publications on `key` until the caller takes them, without waking the event loop."""
         return PolledSubscription(*self._transport.ring(key, depth, messages.largest(kind)), kind, depth)
 
     def frame_publisher(self, key: str) -> FramePublisher:
@@ -511,11 +514,11 @@ class Mesh:
         return FramePublisher(self._transport.publisher(key, None, Quality.FRAME), self._inbox.deliver)
 
     def frames(self, key: str) -> FrameWatch:
-        """The newest frame on `key`, taken as often as the caller can. Close it."""
+        """Watch the newest frame on `key`. The caller takes frames at its own pace, and closes the watch."""
         return FrameWatch(self._transport, key, self._inbox.deliver, self.now)
 
     def alive(self, token: Token) -> Declaration:
-        """Declare the liveliness token until the declaration is closed, or is kept by nobody any more."""
+        """Declare the liveliness token until the declaration is closed or garbage-collected."""
         return Declaration(self._transport.token(self.keys.alive(token)))
 
     def watch(self, key: str, handler: Callable[[Token, bool], None]) -> Declaration:
@@ -530,7 +533,7 @@ class Mesh:
         return Declaration(self._transport.token_subscriber(key, deliver), state)
 
     async def living(self, key: str, *, timeout: float) -> list[Token]:
-        """The tokens on `key` that live now, sorted."""
+        """The live tokens on `key`, sorted."""
         found: set[str] = set()
 
         def on_reply(text: str, *_: object) -> bool:
@@ -541,11 +544,13 @@ class Mesh:
         return sorted(token for token in map(self._token_of, found) if token is not None)
 
     def watch_links(self) -> None:
-        """Show this session by a token, until the mesh is left, and suspect links whose session's token disappeared,
-        unless its program shows another session (Zenoh may not close the old one). For programs that stay."""
+        """Declare a token for this session until the mesh is left, and suspect links to sessions whose token
+        disappeared, unless their program shows another session (Zenoh may not close the old one). For long-running
+        programs."""
         name = functools.partial(Token, self.me.host, Role.SESSION, self.me.client)
         own = self._transport.own_token(lambda session: self.keys.alive(name(session)))
-        shown: dict[str, tuple[set[Sender], Sender]] = {}  # by session: who shows it, and whose word came last
+        # By session: the programs that show a token of it, and the program of the last change.
+        shown: dict[str, tuple[set[Sender], Sender]] = {}
 
         def on_token(token: Token, alive: bool) -> None:
             program = Sender(token.host, token.name)
@@ -574,7 +579,7 @@ class Mesh:
         try:
             return self.keys.token_of(text)
         except BadName as error:
-            self._strange.warning(text, "ignored a liveliness token: %s", error)
+            self._malformed_log.warning(text, "ignored a liveliness token: %s", error)
             return None
 
 

@@ -1,4 +1,4 @@
-"""Tasks, timers and handlers of a service that live and fail together; the host's clock; stalls of the process."""
+"""Supervised tasks, timers and handlers, which fail together; the host's clock; stalls of the process."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ log = logging.getLogger(__name__)
 
 CLOSE_TIMEOUT = 5.0  # seconds that `close` waits for cancelled tasks
 STALL_PERIOD = 0.2  # seconds between two readings of the clock
-STALL_THRESHOLD = SECOND // 5  # a reading this late (ns) means a stall
-AFTERMATH = SECOND // 4  # arrivals this soon after a stall (ns) may have waited through it
+STALL_THRESHOLD = SECOND // 5  # ns by which a reading is late that means a stall
+AFTERMATH = SECOND // 4  # ns after a stall within which an arrival may have waited through it
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -29,14 +29,14 @@ T = TypeVar("T")
 class Supervisor:
     """Owns the tasks, timers and guarded handlers of one service.
 
-    The first that raises is logged with its traceback, `on_failure(error)` is called once, and all others are
-    cancelled. Later failures are logged only. A failed or cancelled supervisor is not reused."""
+    The first exception is logged with its traceback, `on_failure(error)` is called once, and all others are cancelled.
+    Later exceptions are only logged. A failed or cancelled supervisor is not reused."""
 
     def __init__(self, name: str, on_failure: Callable[[Exception], object]) -> None:
         self.name = name
         self.error: Exception | None = None
         self._on_failure = on_failure
-        self.active = True  # false once it failed or was cancelled
+        self.active = True  # False after a failure or a cancellation
         self._tasks: dict[asyncio.Task[Any], None] = {}
         self._timers: WeakSet[asyncio.TimerHandle] = WeakSet()
 
@@ -57,8 +57,8 @@ class Supervisor:
         return handle
 
     def guard(self, f: Callable[P, object]) -> Callable[P, None]:
-        """`f` as a handler for the mesh, not called once the supervisor is inactive. Its exceptions fail the service,
-        and raise Refused (code `internal`) to answer a query; Refused and BadName pass through."""
+        """Wrap `f` as a handler for the mesh, which does nothing once the supervisor is inactive. An exception fails
+        the service, and raises Refused (code `internal`) to answer a query; Refused and BadName pass through."""
 
         @functools.wraps(f)
         def guarded(*args: P.args, **kwargs: P.kwargs) -> None:
@@ -76,7 +76,7 @@ class Supervisor:
 
     def fail(self, error: Exception) -> None:
         """Fail the service with `error`, as if one of its tasks had raised it."""
-        if error is self.error:  # raised on by a task that awaited the one that failed
+        if error is self.error:  # raised again by a task that awaited the failed one
             return
         log.error("%s failed", self.name, exc_info=error)
         if not self.active:
@@ -95,12 +95,12 @@ class Supervisor:
         for handle in tuple(self._timers):
             handle.cancel()
         for task in tuple(self._tasks):
-            # Its loop may have stopped.
+            # The task's loop may have stopped.
             if task is not asyncio.current_task(task.get_loop()):
                 task.cancel()
 
     async def close(self) -> None:
-        """Cancel all, and wait for all tasks but the calling one; log the rest after CLOSE_TIMEOUT."""
+        """Cancel all, wait for all tasks but the calling one, and log those that run longer than CLOSE_TIMEOUT."""
         self.cancel()
         tasks = self._tasks.keys() - {asyncio.current_task()}
         if tasks:
@@ -111,7 +111,7 @@ class Supervisor:
     def _call(self, f: Callable[..., object], *args: Any) -> None:
         try:
             f(*args)
-        except Exception as error:  # noqa: BLE001 - it is logged there
+        except Exception as error:  # noqa: BLE001 - `fail` logs it
             self.fail(error)
 
     def _done(self, task: asyncio.Task[Any]) -> None:
@@ -122,9 +122,9 @@ class Supervisor:
 
 @asynccontextmanager
 async def supervised(name: str) -> AsyncIterator[Supervisor]:
-    """A supervisor for the body of an `async with`: a failure cancels the body, and is raised at its end."""
+    """A supervisor for the body of an `async with`: a failure cancels the body, and is raised when it ends."""
     body = asyncio.current_task()
-    assert body is not None  # noqa: S101 - nothing but a task runs here
+    assert body is not None  # noqa: S101 - a coroutine runs in a task
     supervisor = Supervisor(name, lambda _error: body.cancel())
     try:
         yield supervisor
@@ -143,15 +143,15 @@ async def done_within(seconds: float | None, work: Awaitable[object]) -> bool:
         async with asyncio.timeout(seconds) as limit:
             await work
     except TimeoutError:
-        if not limit.expired():  # the work's own
+        if not limit.expired():  # raised by `work` itself
             raise
         return False
     return True
 
 
 class Alarm:
-    """One timer of a supervised service. Set for a later time it stays, and has to be set again when it goes off: most
-    deadlines are moved before they are over."""
+    """One timer of a supervised service. It is never moved to a later time: most deadlines move before they are
+    reached. When it rings early, `ring` has to set it again."""
 
     def __init__(self, now: Callable[[], Ns], supervisor: Supervisor, ring: Callable[[], object]) -> None:
         self._now, self._supervisor, self._ring = now, supervisor, ring
@@ -164,9 +164,9 @@ class Alarm:
         if self._timer is not None:
             self._timer.cancel()
         self._at = at
-        self._timer = self._supervisor.call_later(max(0.0, (at - self._now()) / SECOND), self._go_off)
+        self._timer = self._supervisor.call_later(max(0.0, (at - self._now()) / SECOND), self._on_timer)
 
-    def _go_off(self) -> None:
+    def _on_timer(self) -> None:
         self._timer = None
         self._ring()
 
@@ -207,11 +207,11 @@ class StallWatch:
         gap = now - self._last - round(STALL_PERIOD * SECOND)
         if gap > STALL_THRESHOLD:
             self.length, self.ended = gap, now
-            log.warning("this process stood still for %.2f s", gap / SECOND)
+            log.warning("process stalled for %.2f s", gap / SECOND)
         self._last = now
 
     def waited_through(self, arrived: Ns) -> Ns:
-        """How long an item that left the network at `arrived` may have waited there."""
+        """How long (ns) a stall may have delayed an item before this process received it, at `arrived`."""
         self.check()
         return self.length if self.length and arrived <= self.ended + AFTERMATH else 0
 

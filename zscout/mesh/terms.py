@@ -1,4 +1,4 @@
-"""Terms promised elsewhere, for processes that know too little to believe one of the last (`messages.LAST_TERMS`)."""
+"""Check one of the last terms (`messages.LAST_TERMS`) against the terms that other processes have promised."""
 
 from __future__ import annotations
 
@@ -14,11 +14,12 @@ from zscout.messages import LAST_TERMS, MAX_COUNTER, ClientRequests, RcAsk, RcmS
 from zscout.types import NO_TERM, Term
 
 MOST_OF_RCS: Final = (LAST_TERMS + MAX_COUNTER) // 2
-"""With certificates: terms above come one by one, whatever RCs obey. Two hosts that lie do not end a fleet."""
+"""With certificates: a higher term that RCs report is ignored, so that two lying hosts can't use up all terms."""
 
 
 class LastTerms:
-    """Queries others, once at a time, when one of the last terms appears; `believe` gets the highest reported."""
+    """Queries other processes, one round at a time, when one of the last terms appears; `believe` gets the highest term
+    reported."""
 
     def __init__(
         self, mesh: Mesh, supervisor: Supervisor, believe: Callable[[Term], object], *, timeout: float
@@ -27,7 +28,7 @@ class LastTerms:
         self._asking: asyncio.Task[None] | None = None
 
     def shown(self, term: Term, known: Term) -> bool:
-        """Return True if `term` is one of the last, incredible after `known` without a second source: query others."""
+        """Return True, and query other processes, if `term` is one of the last terms and not credible after `known`."""
         if not of_the_last(term, known):
             return False
         if self._asking is None or self._asking.done():
@@ -39,8 +40,8 @@ class LastTerms:
 
 
 async def promised_elsewhere(mesh: Mesh, *, timeout: float) -> Term:
-    """The highest term promised by RCs and clients, or led in by an RCM, whose tokens are alive. Of contradicting
-    replies of one witness the lower counts, so an impostor can only lower it."""
+    """The highest term that RCs and clients with live tokens have promised, or in which a live RCM leads. Of
+    contradicting replies of one witness the lowest counts, so an impostor can only lower the result."""
     keys = mesh.keys
     tokens, rcs, clients, leaders = await asyncio.gather(
         mesh.living(keys.alive_any(), timeout=timeout),
@@ -49,33 +50,33 @@ async def promised_elsewhere(mesh: Mesh, *, timeout: float) -> Term:
         mesh.ask(keys.ask_state(mesh.me), StateAsk(holds_only=True), RcmState, timeout=timeout),
     )
     seen = {key for token in tokens if (key := _key_of(mesh, token)) is not None}
-    # A leader's instance has one term: it vouches for itself.
+    # A leader's instance has one term, so its own report counts.
     seen |= {token.instance for token in tokens if token.role == Role.RCM}
     if keys.closed:
-        # There a leader's word counts, or that of the RCs of two hosts.
-        rcs, clients = _second(rcs, tokens), []
-    said = [(reply.key, reply.message.term) for reply in rcs if reply.message is not None]
-    said += [(reply.key, reply.message.term) for reply in clients if reply.message is not None]
-    said += [(reply.message.term.rcm, reply.message.term) for reply in leaders if reply.message is not None]
-    words = dict[str, Term]()
-    for witness, term in said:
+        # On a fleet with certificates, a leader counts, or RCs of two hosts.
+        rcs, clients = _confirmed(rcs, tokens), []
+    reported = [(reply.key, reply.message.term) for reply in rcs if reply.message is not None]
+    reported += [(reply.key, reply.message.term) for reply in clients if reply.message is not None]
+    reported += [(reply.message.term.rcm, reply.message.term) for reply in leaders if reply.message is not None]
+    lowest = dict[str, Term]()
+    for witness, term in reported:
         if witness in seen and term.counter <= MAX_COUNTER:
-            words[witness] = min(term, words.get(witness, term))
-    return max(words.values(), default=NO_TERM)
+            lowest[witness] = min(term, lowest.get(witness, term))
+    return max(lowest.values(), default=NO_TERM)
 
 
-def _second(replies: list[Reply[RcState]], tokens: list[Token]) -> list[Reply[RcState]]:
-    """Of RCs that are seen, those which obey no higher term than RCs of another host do, nor one above MOST_OF_RCS."""
+def _confirmed(replies: list[Reply[RcState]], tokens: list[Token]) -> list[Reply[RcState]]:
+    """Replies of live RCs whose term is at most MOST_OF_RCS and no higher than the term of an RC on another host."""
     hosts = {(token.name, token.instance): token.host for token in tokens if token.role == Role.RC}
-    shown = [
+    live = [
         (reply, reply.message.term, host)
         for reply in replies
         if reply.message is not None and (host := hosts.get((reply.message.rc, reply.message.instance))) is not None
     ]
     return [
         reply
-        for reply, term, host in shown
-        if term.counter <= MOST_OF_RCS and any(other != host and another >= term for _, another, other in shown)
+        for reply, term, host in live
+        if term.counter <= MOST_OF_RCS and any(other != host and another >= term for _, another, other in live)
     ]
 
 

@@ -1,4 +1,4 @@
-"""The network below a mesh: bytes by key. Callbacks may come on any thread, and must not block."""
+"""The network below a mesh: bytes by key. Callbacks may run on any thread, and must not block."""
 
 from __future__ import annotations
 
@@ -11,22 +11,22 @@ Undeclare: TypeAlias = Callable[[], None]
 
 
 class Quality(Enum):
-    CONTROL = "control"  # blocks while a peer does not read
-    DATA = "data"  # dropped rather than wait; yields to control
-    FRAME = "frame"  # JPEG frames, dropped alike
+    CONTROL = "control"  # the sender blocks while a peer does not read
+    DATA = "data"  # dropped rather than queued; of lower priority than control
+    FRAME = "frame"  # JPEG frames, dropped rather than queued
 
 
 class Collector(Protocol):
-    """Takes the replies to one query, and then its end, once."""
+    """Receives the replies to one query, and then its end, once."""
 
     def on_reply(self, key: str, payload: bytes, ok: bool) -> None:
-        """`ok`: `payload` is a message rather than an error."""
+        """`ok` is True for a message, False for an error."""
 
     def on_final(self) -> None: ...
 
 
 class TransportQuery(Protocol):
-    """A query that arrived. Each method ends it; an unended query keeps its sender waiting."""
+    """A query that arrived. Each method ends it; until then its sender waits."""
 
     @property
     def key(self) -> str: ...
@@ -50,7 +50,7 @@ class Transport(Protocol):
     """A session on the network. Failures to send are logged; queries raise MeshError."""
 
     def id(self) -> str:
-        """The session id that the network shows to others."""
+        """The session id that other processes see."""
 
     def peers(self) -> list[str]:
         """Ids of the linked sessions."""
@@ -60,13 +60,13 @@ class Transport(Protocol):
     async def close(self) -> None: ...
 
     def get(self, key: str, payload: bytes | None, kind: type | None, timeout: float, to: Collector) -> None:
-        """Query all servers of `key`; ends after `timeout` seconds at the latest."""
+        """Query all servers of `key`; the query ends after at most `timeout` seconds."""
 
     def queryable(self, key: str, on_query: Callable[[TransportQuery], None]) -> Undeclare: ...
     def publisher(self, key: str, kind: type | None, quality: Quality) -> TransportPublisher: ...
     def put(self, key: str, payload: bytes, kind: type) -> None: ...
     def subscriber(self, key: str, on_sample: OnSample) -> Undeclare:
-        """Skips deletes, and publications on keys with a wildcard; so does `ring`."""
+        """Skip deletes, and publications on keys with a wildcard, as `ring` does too."""
 
     def ring(self, key: str, depth: int, most: int) -> tuple[Callable[[], tuple[str, bytes] | None], Undeclare]:
         """Keep the latest `depth` publications; the first function returned takes the oldest."""
@@ -75,4 +75,4 @@ class Transport(Protocol):
     def token_subscriber(self, key: str, on_token: Callable[[str, bool], None]) -> Undeclare: ...
 
     def tokens(self, key: str, timeout: float, to: Collector) -> None:
-        """Living tokens, as keys of replies."""
+        """Query the live tokens; each is the key of a reply."""

@@ -42,9 +42,9 @@ from zscout.mesh.transport import Collector, OnSample, Quality, Transport, Trans
 
 log = logging.getLogger(__name__)
 
-CONTROL_BATCHES = 8  # control messages in flight per peer: with fewer, an answer waits for the message before it
+CONTROL_BATCHES = 8  # control messages in flight per peer; with fewer, an answer waits for the previous message
 SCOUTING_DELAY_MS = 200
-SESSION_FILES, SESSION_THREADS = 40, 36  # that a session opens and starts, its links included
+SESSION_FILES, SESSION_THREADS = 40, 36  # used by one session and its links
 THREADS = "ZENOH_RUNTIME"
 # With few receiving threads one unreachable host stalls every link.
 MANY_THREADS = (
@@ -76,7 +76,7 @@ class Security(NamedTuple):
 
 
 def zenoh_config(config: MeshConfig, security: Security | None = None, meeting: Meeting | None = None) -> zenoh.Config:
-    """The Zenoh settings for a `[mesh]` table, for one session that is opened now; `meeting`: with its neighbours."""
+    """Zenoh settings for a `[mesh]` table, valid for a session that is opened now; `meeting` adds its neighbours."""
     known, found = known_to_zenoh(), interfaces.addresses()
     v6_group = config.multicast_address.startswith("[")
     settings: dict[str, Any] = {
@@ -90,10 +90,11 @@ def zenoh_config(config: MeshConfig, security: Security | None = None, meeting: 
         "scouting/multicast/autoconnect_strategy": GREATER_CONNECTS,
         "scouting/gossip/autoconnect_strategy": GREATER_CONNECTS,
         "transport/link/tx/lease": round(config.lease * 1000),
-        # As for silence: on a busy host Zenoh's sending threads stall too, and any burst would cost a sound link.
+        # The same as the lease: on a busy host Zenoh's sending threads stall too, and a burst must not close a good
+        # link.
         "transport/link/tx/queue/congestion_control/block/wait_before_close": round(config.lease * 1_000_000),
         "transport/link/tx/queue/size": {"interactive_high": CONTROL_BATCHES},
-        # Larger messages are cut off: a sender could fill this process's memory.
+        # Otherwise a sender could fill this process's memory.
         "transport/link/rx/max_message_size": MAX_MESSAGE,
         "transport/shared_memory/enabled": False,
         "connect/retry": {"period_init_ms": 50, "period_max_ms": 500, "period_increase_factor": 1.5},
@@ -116,7 +117,7 @@ def zenoh_config(config: MeshConfig, security: Security | None = None, meeting: 
     if connect:
         settings["connect/endpoints"] = connect
     if security is not None:
-        settings |= _closed(security)
+        settings |= _secured(security)
     result = zenoh.Config()
     for key, value in settings.items():
         result.insert_json5(key, json.dumps(value))
@@ -125,12 +126,12 @@ def zenoh_config(config: MeshConfig, security: Security | None = None, meeting: 
 
 @functools.cache
 def known_to_zenoh() -> frozenset[interfaces.HostAddress]:
-    """The addresses of this host when Zenoh's settings were made first: it reads them about then, and never again."""
+    """The addresses of this host when settings were first made: Zenoh reads them about then, and never again."""
     return interfaces.addresses()
 
 
-def _closed(security: Security) -> dict[str, Any]:
-    """Settings that admit members of the fleet alone, and limit what each may send. Each is needed."""
+def _secured(security: Security) -> dict[str, Any]:
+    """Settings that admit only members of the fleet, and limit what each may send. All are needed."""
     own = security.certificates
     return {
         # Otherwise a peer links to announced addresses without TLS.
@@ -142,9 +143,9 @@ def _closed(security: Security) -> dict[str, Any]:
             "connect_private_key": str(own.key),
             "connect_certificate": str(own.cert),
             "enable_mtls": True,
-            # A name means a machine or a person, not an address; the rules below use it.
+            # Certificates name a machine or a person, not an address; the access rules below use the name.
             "verify_name_on_connect": False,
-            # Links outlive the certificate they began with: certificates are renewed in place.
+            # Certificates are renewed in place: a link may outlive the one it was made with.
             "close_link_on_expiration": False,
         },
         "access_control": access_control(security.keys, security.members),
@@ -152,18 +153,19 @@ def _closed(security: Security) -> dict[str, Any]:
 
 
 class RightsFile:
-    """The rights in a fleet file, for a program that follows them."""
+    """The rights in a fleet file, read again when the file changes."""
 
     def __init__(self, file: Path, access: AccessPolicy) -> None:
         self._file, self._access = file, access
         self._seen: tuple[int, ...] | None = None
 
     def changed(self) -> AccessPolicy | None:
-        """The rights, if they have changed since the last call. An error is logged once, and changes nothing."""
+        """Return the rights if they changed since the last call, else None. An error is logged once per version of the
+        file, and keeps the previous rights."""
         try:
             stat = self._file.stat()
             seen = stat.st_mtime_ns, stat.st_size, stat.st_ino
-        except OSError:  # it is being replaced; or this program changed its user
+        except OSError:  # the file is being replaced, or this program changed its user
             return None
         if seen == self._seen:
             return None
@@ -171,37 +173,37 @@ class RightsFile:
         try:
             access = load_fleet(self._file).access
         except BadInput as error:
-            log.warning("%s; the rights of before stay", error)
+            log.warning("%s; keeping the previous rights", error)
             return None
         before, self._access = self._access, access
         return None if access == before else access
 
 
 @dataclass(slots=True)
-class _Door:
+class _Admission:
     security: Security | None
 
 
 class ZenohMesh(Mesh):
-    _door: _Door
+    _admission: _Admission
     _watching: tuple[asyncio.Task[NoReturn], ...] = ()
 
     @classmethod
     async def open(cls, fleet: Fleet, me: Sender, *, follow: bool = True) -> Self:
-        """Join the mesh of `fleet`; `follow`: take changed rights from its file, as a node does at a reload alone.
-        Raises MeshError if an address can't be had, BadInput for bad certificates."""
+        """Join the mesh of `fleet`; `follow`: apply rights as soon as the fleet file changes (a node does at a reload).
+        Raises MeshError if an address is not available, BadInput for bad certificates."""
         config, keys = fleet.mesh, Keys(fleet.name, closed=fleet.security is not None)
         security = None if fleet.security is None else _security(fleet, keys, me)
-        door, found = _Door(security), interfaces.addresses()
-        openings = [lambda: _open(fleet.name, config, door.security)]
+        admission, found = _Admission(security), interfaces.addresses()
+        openings = [lambda: _open(fleet.name, config, admission.security)]
         if config.listen:
-            # Until the old session frees its ports, one on other ports learns the peers from it.
+            # The old session has the ports until it closes; a session on other ports learns the peers from it first.
             own = tuple(at.replace("0.0.0.0", "127.0.0.1").replace("[::]", "[::1]") for at in config.listen)  # noqa: S104
             ports = tuple(_PORT.sub(":0", at) for at in config.listen)
             beside = replace(config, listen=ports, connect=(*config.connect, *own), shared=config.known_by)
-            openings.insert(0, lambda: _open(fleet.name, beside, door.security))
+            openings.insert(0, lambda: _open(fleet.name, beside, admission.security))
         mesh = cls(RenewableTransport(await _open(fleet.name, config, security), openings), keys, me, clock.now)
-        mesh._door = door
+        mesh._admission = admission
         if security is not None:
             mesh.validity = security.certificates
             rights = RightsFile(fleet.file, fleet.access) if follow and fleet.file is not None else None
@@ -215,7 +217,7 @@ class ZenohMesh(Mesh):
         await super().close()
 
     async def _watch_interfaces(self, used: frozenset[interfaces.HostAddress]) -> NoReturn:
-        """Reopen the session for each address that appears: Zenoh uses those alone that it was opened with."""
+        """Reopen the session when addresses appear: Zenoh uses only those with which the session was opened."""
         before = used
         while True:
             await asyncio.sleep(interfaces.LOOK_EVERY)
@@ -231,9 +233,9 @@ class ZenohMesh(Mesh):
             before = now
 
     async def _watch_files(self, known: Certificates, rights: RightsFile | None) -> NoReturn:
-        """Warn before certificates end, and reopen the session once these or the rights have changed: it keeps those
-        it was opened with."""
-        told: str | None = None
+        """Warn before certificates end, and reopen the session when certificates or rights changed: a session keeps
+        those it was opened with."""
+        logged: str | None = None
         warned = ""
         while True:
             await asyncio.sleep(LOOK_AT_FILES)
@@ -245,12 +247,12 @@ class ZenohMesh(Mesh):
                 reading = in_thread("reads certificates", functools.partial(read_certificates, known.folder))
                 fresh = await asyncio.wrap_future(reading)
                 fresh.check(datetime.now(UTC), known.name)
-            except BadInput as error:  # they may be half written
-                if told != str(error):
+            except BadInput as error:  # the files may be half written
+                if logged != str(error):
                     log.warning("%s", error)
-                told = str(error)
+                logged = str(error)
                 continue
-            told = None
+            logged = None
             if fresh.ends != known.ends:
                 log.info("%s was renewed: reopening the mesh session", fresh.cert)
                 known = self.validity = fresh
@@ -259,15 +261,15 @@ class ZenohMesh(Mesh):
                 log.warning("%s", warned := soon)
 
     def admit(self, members: Iterable[FleetMember]) -> None:
-        # The rules of a session can't be changed.
-        if self._door.security is not None:
-            self._door.security = self._door.security._replace(members=tuple(members))
+        # Zenoh can't change the rules of an open session.
+        if self._admission.security is not None:
+            self._admission.security = self._admission.security._replace(members=tuple(members))
             self._transport.take_settings()
 
 
 def _security(fleet: Fleet, keys: Keys, me: Sender) -> Security:
     """Raises BadInput."""
-    assert fleet.security is not None  # noqa: S101 - its caller has looked
+    assert fleet.security is not None  # noqa: S101 - the caller has checked
     own = read_certificates(fleet.security)
     own.check(datetime.now(UTC), me.host)
     if not fleet.access.ranks_of(me.host):
@@ -276,13 +278,13 @@ def _security(fleet: Fleet, keys: Keys, me: Sender) -> Security:
 
 
 def increasing_id() -> str:
-    """A session id greater than all earlier ones, so that the newcomer makes the links. Zenoh compares ids
-    from the last byte on, and prints them as a number."""
+    """A session id greater than all earlier ones, so that the newer session makes the links. Zenoh compares ids from
+    the last byte on, and prints them as a number."""
     return f"1{secrets.token_hex(9)}0{time.time_ns().to_bytes(8, 'little').hex()[4:]}"
 
 
 def check_room(files: int = SESSION_FILES, threads: int = SESSION_THREADS) -> None:
-    """Raises OSError or RuntimeError where this process can't have so many more: Zenoh ends the process then."""
+    """Raise OSError or RuntimeError if this process can't have so many more files and threads: Zenoh would end it."""
     opened, started, done = list[int](), list[threading.Thread](), threading.Event()
     try:
         while len(opened) < files:
@@ -309,13 +311,13 @@ def open_session(settings: Callable[[], zenoh.Config]) -> zenoh.Session:
         check_room()
     except (OSError, RuntimeError) as error:
         raise MeshError(f"the mesh can't be joined: {shortage(error) or error}") from None
-    # Zenoh reads this when it opens its first session. It is none of the programs that this one starts.
+    # Zenoh reads this when it opens its first session. Programs that this process starts must not inherit it.
     if THREADS not in os.environ:
         os.putenv(THREADS, MANY_THREADS)
     try:
         return zenoh.open(settings())
     except zenoh.ZError as error:
-        # Without the places in Zenoh's source.
+        # Without positions in Zenoh's source.
         why = re.sub(r" at \S+\.rs:[0-9]+\.?", "", str(error))
         raise MeshError(f"the mesh can't be joined: {why}; check listen and connect under [mesh]") from None
     finally:
@@ -326,7 +328,7 @@ def open_session(settings: Callable[[], zenoh.Config]) -> zenoh.Session:
 async def _open(fleet: str, config: MeshConfig, security: Security | None) -> Transport:
     met: Meeting | None = None
     if config.known_by and not config.relay:
-        with suppress(OSError):  # multicast, and `connect`, find the neighbours
+        with suppress(OSError):  # without it multicast and `connect` find the neighbours
             met = Meeting(fleet, config, "tcp" if security is None else "tls")
     opening = in_thread("joins the mesh", lambda: open_session(lambda: zenoh_config(config, security, met)))
     try:
@@ -334,15 +336,15 @@ async def _open(fleet: str, config: MeshConfig, security: Security | None) -> Tr
     except BaseException:
         if met is not None:
             met.close()
-        # In a thread: this may be the event loop's.
+        # Close in a thread: this callback may run on the event loop's.
         opening.add_done_callback(
             lambda opened: opened.exception() or in_thread("closes the mesh", opened.result().close)
         )
         raise
     if met is not None:
-        met.listens()
+        met.release_port()
     try:
-        # A relay leaves relinking to its sites, which know its address.
+        # A relay leaves relinking to its sites, which have its address.
         relinks = config.multicast and not config.relay
         return ZenohTransport(session, _relinking(session, config, security) if relinks else None, met)
     except BaseException:
@@ -361,19 +363,19 @@ def _relinking(session: zenoh.Session, config: MeshConfig, security: Security | 
 
 
 _opened_in: int | None = None
-"""The process that opened a session. Zenoh's threads do not survive a fork: a session opened in the child hangs, and
-can crash the parent."""
+"""Id of the process that opened a session. Zenoh's threads do not survive a fork: a session opened in the child hangs,
+and can crash the parent."""
 
 
 def in_thread(name: str, call: Callable[[], T]) -> Future[T]:
-    """Call in a daemon thread: asyncio would join its own at the end of the loop, however long that takes."""
+    """Call in a daemon thread. When the loop ends, asyncio would wait for its own threads without a limit."""
     future: Future[T] = Future()
     future.set_running_or_notify_cancel()
 
     def run() -> None:
         try:
             future.set_result(call())
-        except BaseException as error:  # noqa: BLE001 - it is raised to who awaits it
+        except BaseException as error:  # noqa: BLE001 - raised where the future is awaited
             future.set_exception(error)
 
     threading.Thread(target=run, name=name, daemon=True).start()
@@ -381,7 +383,7 @@ def in_thread(name: str, call: Callable[[], T]) -> Future[T]:
 
 
 class ZenohTransport(Transport):
-    # Callbacks are direct, on Zenoh's threads: a plain function would get its own thread per declaration and query.
+    # Callbacks run directly on Zenoh's threads: a plain function would get a thread per declaration and query.
 
     def __init__(
         self, session: zenoh.Session, relinking: Relinking | None = None, meeting: Meeting | None = None
@@ -432,7 +434,7 @@ class ZenohTransport(Transport):
             raise MeshError(f"{key} can't be asked: {error}") from None
 
     def _querier(self, key: str, timeout: float) -> zenoh.Querier | None:
-        """The querier for a key asked before, faster than a get; None for others."""
+        """Return a querier, faster than a get, for a key that was queried before; None for others."""
         asked = key, timeout
         if (known := self._queriers.get(asked)) is not None or "*" in key or len(self._queriers) >= MAX_QUERIERS:
             return known
@@ -474,7 +476,7 @@ class ZenohTransport(Transport):
                 kept.append(sample)
 
         def take() -> tuple[str, bytes] | None:
-            # Copied here only: most are replaced by a newer one before.
+            # Copy the payload only now: most samples are replaced by newer ones before.
             sample = kept.popleft() if kept else None
             return None if sample is None else (str(sample.key_expr), sample.payload.to_bytes())
 
@@ -542,7 +544,7 @@ class ZenohPublisher(TransportPublisher):
     def match(self, on_matching: Callable[[bool], None]) -> bool:
         callback = _direct(lambda status: on_matching(bool(status.matching)))
         self._listener = self._publisher.declare_matching_listener(callback)
-        # Typed as a bool, but the object it gives is true in either case.
+        # Typed as a bool, but it returns an object that is true in either case.
         status: Any = self._publisher.matching_status
         return bool(status.matching)
 
@@ -555,7 +557,7 @@ def _encoding(kind: type | None) -> zenoh.Encoding:
 
 
 def _is_publication(sample: zenoh.Sample) -> bool:
-    """Return True for puts on concrete keys: one on a wildcard would pass for every sender's."""
+    """Return True for puts on concrete keys: a put on a wildcard would pass for a publication of every sender."""
     return sample.kind == zenoh.SampleKind.PUT and "*" not in str(sample.key_expr)
 
 

@@ -141,7 +141,7 @@ def test_what_is_done_soon_is_no_failure(fleet: CliFleet) -> None:
     assert json.loads(done.stdout)["state"] in ("running", "ended")
     followed = fleet.until(lambda done: done.returncode == 0, "logs", "brief", "--follow")
     # Beside its own words there may be that its process stood still.
-    assert [line for line in followed.stdout.splitlines() if "stood still" not in line] == ["last words"]
+    assert [line for line in followed.stdout.splitlines() if "process stalled" not in line] == ["last words"]
     assert followed.stderr.startswith("-- brief has ended")
 
 

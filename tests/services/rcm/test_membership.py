@@ -245,7 +245,7 @@ async def test_a_client_that_is_seen_and_does_not_say_what_it_asks_for_is_a_cont
     robots = [holding(fleet, name) for name in HELD.rcs]
     await fleet.joined(*robots)
     fleet.client("one")
-    said = "desk/one is seen and does not answer: this process joins the mesh anew"
+    said = "desk/one is seen and does not answer: reopening the mesh session"
     await until(lambda: said in caplog.messages)
     fleet.network.disturb({})
     await until(lambda: not any(robot.holders for robot in robots))
