@@ -27,7 +27,7 @@ from zscout.types import SECOND, Ns
 PERIOD: Final = 0.05
 """Seconds between two readings of the pilot."""
 LONGEST: Final = 0.6
-"""Most seconds that one command drives: the robot stops after that if its operator is cut off."""
+"""Longest drive of a single command, in seconds: the robot stops after that if its operator is cut off."""
 RETRY_AFTER: Final = 1.0
 """Seconds after a refusal until the robot is requested again."""
 
@@ -37,9 +37,9 @@ AT_LEAST: Final = 1.0
 ASKS_AGAIN: Final = frozenset({"preempted", "lost"})
 """Outcomes of a hold after which the robot is requested again; after others, which are deliberate, it is not."""
 FIRST: Final = 0.6
-"""Seconds that one press of a key drives."""
+"""Seconds of driving per press of a key."""
 NEXT: Final = 0.25
-"""Seconds that each repetition of a pressed key drives."""
+"""Seconds of driving per repetition of a pressed key."""
 REPEATS: Final = 0.55
 """Most seconds between two presses of a key that count as repetition."""
 STICK_TIMEOUT: Final = 1.0

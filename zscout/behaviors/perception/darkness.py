@@ -53,7 +53,7 @@ class View(NamedTuple):
 
 
 def analyse(picture: Picture) -> View:
-    """Light and dark places of one picture of shape (120, 160)."""
+    """Measure the light and find the dark places of one picture of shape (120, 160)."""
     light = linear(picture)
     lit = max(float(np.percentile(light[_BELOW + 3 :], 80)), 1e-4)
     near = _middle(light[110:, 20:140])
@@ -74,7 +74,7 @@ def analyse(picture: Picture) -> View:
 
 
 def _places(light: NDArray[np.float32], lit: float) -> tuple[DarkPlace, ...]:
-    """Candidates of all levels; of overlapping ones the widest at its darkest level."""
+    """Find the dark places of all levels; of overlapping places keep the widest, at its darkest level."""
     # Smooth along the rows: noise does not break a gap, edges between rows stay.
     smooth = light.copy()
     smooth[:, 1:-1] = (light[:, :-2] + light[:, 1:-1] + light[:, 2:]) / 3

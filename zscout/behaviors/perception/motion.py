@@ -1,22 +1,22 @@
 """Motion in a camera's pictures: where, and from when to when. Pure: times and pictures in.
 
 A `MotionDetector` returns a `Seen` per picture, an `EventTracker` turns these into events. A background of running
-means and variances per pixel (Wren et al., "Pfinder", 1997; the two thresholds are Canny's hysteresis), with what a
-real camera needs:
-- Rates are by time, so that 2 and 30 pictures a second learn alike.
-- Each picture is brought to the background's brightness: gain and offset by robust least squares over blocks. So
-flicker, exposure and slow light changes are no motion.
-- A pixel counts by standard deviations of its own noise, never by grey levels: no tuning.
-- Light that rolls over the picture in bands is each line's own gain.
+means and variances per pixel (Wren et al., "Pfinder", 1997; the two thresholds are Canny's hysteresis), adapted to
+real cameras:
+- Rates are per second, so that 2 and 30 pictures a second learn alike.
+- Each picture is adjusted to the background's brightness, by gain and offset from robust least squares over blocks. So
+flicker, exposure and slow changes of light are no motion.
+- A pixel's deviation is measured in standard deviations of its own noise, never in grey levels: no tuning.
+- Bands of light that roll over the picture are compensated by a gain per line.
 - Lines that fit the background when displaced are torn by the transmission.
-- A change of most of the picture at once is a switched light or a moved camera: it is learned at once. Somebody
-close to the lens is not: he grew.
-- What is small and stands where it came is no motion: a clock in the picture.
-- Drops of rain and flakes of snow are in one picture each (`rain.py`).
-- Motion needs two of three pictures at about the same place, or one that is upright and clear.
+- A change of most of the picture at once is a switched light or a moved camera, and is learned at once. A person
+close to the lens is recognized by growing, and is not learned.
+- Small regions that don't move after they appear are no motion: the digits of a clock.
+- Drops of rain and flakes of snow appear in one picture each (`rain.py`).
+- Motion must be in two of three pictures at about the same place, or in one picture as an upright, clear region.
 
-Whatever stays is learned as that pixel's noise: a person who stops is no motion after a second or two, and leaves no
-ghost behind. The background itself follows within half a minute."""
+Deviations that persist are learned as that pixel's noise: a person who stops is no motion after a second or two, and
+leaves no ghost behind. The background itself follows within half a minute."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ _Regions = NDArray[np.int32]  # left, top, width, height and area of each
 
 
 class Box(NamedTuple):
-    """In pixels of the source."""
+    """A rectangle in pixels of the source."""
 
     x: int
     y: int
@@ -118,7 +118,7 @@ class Event(NamedTuple):
     boxes: tuple[Box, ...]  # motion at the peak, largest first, in pixels of the source
     area: Box  # around all motion of the event
     frames: int  # pictures with motion
-    going_on: bool = False  # it was not over when the watch was
+    going_on: bool = False  # True if the watch ended during the event
 
 
 class _Meanwhile:
@@ -136,7 +136,7 @@ class _Meanwhile:
         self.level += off / self.pictures
 
     def another(self) -> NDArray[np.bool_]:
-        """Changed regions that are still; the rest moves, or was spoiled in transmission."""
+        """Return the changed regions that are still; the others move, or were spoiled in transmission."""
         count, labels = cv2.connectedComponents(_with_rim(self._mask))
         area = np.bincount(labels.ravel(), minlength=count)
         differ = np.bincount(labels.ravel(), weights=self._differ.ravel(), minlength=count)
@@ -154,7 +154,7 @@ class _Near:
         self._level = level
 
     def stirs(self, time: float, level: _Plane, mask: NDArray[np.uint8], noise: float) -> bool:
-        """Take a picture and where it moves; return True unless he stands still, or has been there for long."""
+        """Take a picture and its moving pixels; return True unless the person is still, or has been there for long."""
         self.mask = mask
         # Smoothing leaves 0.6 of the noise of two pictures.
         off = np.abs(cv2.GaussianBlur(level - self._level, (3, 3), 0)) > 0.6 * WEAK * max(FLOOR, noise)
@@ -165,7 +165,8 @@ class _Near:
 
 class MotionDetector:
     def __init__(self, *, outlines: bool = False, limits: MotionLimits | None = None) -> None:
-        """With `outlines`, report moving pixels too, and fit boxes to them. Durations are the trackers' to limit."""
+        """With `outlines`, also report moving pixels, and fit boxes to them. `limits.min_duration` is ignored here:
+        give it to an EventTracker."""
         self._limits = limits or MotionLimits()
         self._ignored: Mask | None = None  # 255 where motion does not count; None without such regions
         self._smallest = max(SMALLEST, self._limits.min_area)
@@ -224,13 +225,13 @@ class MotionDetector:
         score, middle = self._score(away)
         mask, regions, clear = self._regions(score, level, time)
         share = np.count_nonzero(mask) / (mask.size if self._ignored is None else max(1, np.sum(self._ignored == 0)))
-        # Nothing asks for it where nothing moves.
+        # The noise is needed only if something moves.
         noise = float(np.median(self._variance[::4, ::4])) ** 0.5 if share or self._near is not None else 0.0
         stirs = self._near is not None and self._near.stirs(time, level, mask, noise)
         if middle > ALL_OFF or (share > UPHEAVAL and not stirs):
             return self._begin(time, grey), None
         drops = self._rain.drops
-        # A pixel that is clearly off is learned slowly, region or not: a busy road is no noise.
+        # A pixel that is clearly off is learned slowly, even outside regions: a busy road is no noise.
         moved = mask | (score > STRONG).astype(np.uint8)
         if drops is not None:
             moved |= drops
@@ -255,7 +256,7 @@ class MotionDetector:
         elif self._near is None:
             self._near = _Near(time, level, mask)
         if drops is not None and not moving:
-            # A drop that nothing confirms begins no event.
+            # An unconfirmed drop begins no event.
             boxes = ()
         noise = _noise(grey) if self._presence.expects(moving) else 0.0
         present = self._presence.see(time, level, self._mean, mask if moving else None, noise)
@@ -268,7 +269,8 @@ class MotionDetector:
         return noise < CLEARER * before or _off(away) > max(OTHER, OTHER_NOISE * noise)
 
     def pause(self) -> None:
-        """Pictures pause. The first fitting one continues the background; until then nothing is reported."""
+        """Prepare for a pause. The first pictures afterwards that fit the background continue it; until then nothing is
+        reported."""
         self._sightings.clear()
         self._presence.clear()
         self._near = None
@@ -288,7 +290,7 @@ class MotionDetector:
         changed = np.count_nonzero(mask) / mask.size
         alike = 1 / ALIKE <= _noise(grey) / max(self._noise, 1e-3) <= ALIKE
         if not alike or middle > ALL_OFF or changed > CHANGED:
-            # The camera is warming up, was moved, or this is another's picture.
+            # The camera is warming up or was moved, or the picture is from another camera.
             self._meanwhile, self._strange = None, self._strange + 1
             anew = time - self._back > RETURN or self._strange >= STRANGE
             return self._begin(time, grey) if anew else Seen(False, learning=True)
@@ -299,7 +301,7 @@ class MotionDetector:
         if time - self._meanwhile.since < AGREE[0] and self._meanwhile.row < APART:
             return Seen(False, learning=True)
         self._paused = False
-        # Changes in the pause count as still. So few pictures leave their noise and mean unsure.
+        # Changes during the pause count as still. With so few pictures, their noise and mean are uncertain.
         another = self._meanwhile.another()
         noise = max(FLOOR, _noise(level)) ** 2 * (1 + 1 / self._meanwhile.pictures)
         self._mean = np.where(another, self._meanwhile.level, self._mean)
@@ -314,7 +316,7 @@ class MotionDetector:
             if len(corners) == 2:
                 (left, top), (right, bottom) = corners
                 corners = np.array([(left, top), (right, top), (right, bottom), (left, bottom)])
-            # A pixel's middle is at its number.
+            # Integer coordinates are the centres of pixels.
             cv2.fillPoly(drawn, [np.rint(corners - 0.5).astype(np.int32)], (255,))
         return drawn
 
@@ -332,11 +334,12 @@ class MotionDetector:
         return Seen(False, learning=True)
 
     def _hidden(self) -> NDArray[np.uint8] | None:
-        """Above 0 where somebody near was in the last picture; None without one."""
+        """Return a mask, above 0 where a person near the lens was in the last picture; None without one."""
         return None if self._near is None else _with_rim(self._near.mask)
 
     def _score(self, away: _Plane) -> tuple[_Plane, float]:
-        """Standard deviations by which each pixel is off, smoothed, relative to the median, which is returned too."""
+        """Return by how many standard deviations each pixel is off, smoothed, relative to the median; and the
+        median."""
         # Neighbours have similar noise: their mean bounds one pixel's few samples from below.
         spread = np.sqrt(np.maximum(np.maximum(self._variance, cv2.blur(self._variance, (5, 5))), FLOOR**2))
         score = np.abs(cv2.GaussianBlur(away, (3, 3), 0)) / spread
@@ -345,7 +348,7 @@ class MotionDetector:
             shown = score if self._ignored is None else score[self._ignored == 0]
             self._middle = float(np.median(shown)) if shown.size else 0.0
         elif (left := score[hidden == 0]).size >= LEFT * score.size:
-            # He may cover more by now: the lower quartile, by what it is to the median of noise.
+            # The person may cover more by now, so use the lower quartile, scaled to the median of normal noise.
             noise = float(np.quantile(left, 0.25)) * 0.674 / 0.319
             self._middle = noise if noise <= ALL_OFF else self._middle
         middle = self._middle
@@ -362,7 +365,8 @@ class MotionDetector:
         self._variance += rate * (away * away - self._variance)
 
     def _regions(self, score: _Plane, level: _Plane, time: float) -> tuple[NDArray[np.uint8], _Regions, _Regions]:
-        """Connected pixels above WEAK with some above STRONG: mask (255 or 0), stats, and stats of certain regions."""
+        """Return regions of pixels above WEAK with some above STRONG: mask (255 or 0), stats, stats of certain
+        regions."""
         weak = (score > WEAK).astype(np.uint8)
         # Torn lines and hot pixels are thinner than anything that moves.
         thick = np.asarray(cv2.morphologyEx(weak, cv2.MORPH_OPEN, np.ones((3, 2), np.uint8)), np.uint8)
@@ -400,13 +404,14 @@ class MotionDetector:
                     agree += bool(np.any(earlier & _around(moving)))
                     fresh, before = fresh | moving, before | whole
             fresh |= mask & ~_around(before)
-        # What stands confirms nothing later either.
+        # A region that does not move can't confirm later sightings either.
         self._sightings.append((time, fresh, mask, level))
         return bool(np.any(mask)) and 1 + agree >= (SURE if self._rain.drops is None else RECENT)
 
 
 def _moving(mask: NDArray[np.uint8], off: _Plane, noise: float) -> NDArray[np.uint8]:
-    """The regions without small ones that stand where they came: a clock's digits. All where noise hides changes."""
+    """Return the regions without small ones that don't move, as a clock's digits; all regions if noise hides
+    changes."""
     if noise > QUIET:
         return mask
     count, labels, stats, _ = cv2.connectedComponentsWithStats(mask, connectivity=8)
@@ -420,7 +425,7 @@ def _moving(mask: NDArray[np.uint8], off: _Plane, noise: float) -> NDArray[np.ui
 
 
 def _around(mask: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Where the next sighting of the same motion may be."""
+    """Return the area in which the next sighting of the same motion may be."""
     return np.asarray(cv2.dilate(mask, np.ones((15, 25), np.uint8)), np.uint8)
 
 
@@ -469,10 +474,10 @@ def _levelled(
     last: tuple[float, float],
     ignored: NDArray[np.uint8] | None = None,
 ) -> tuple[_Plane, tuple[float, float]]:
-    """The picture without its gain and offset against the background and without bands of light; gain and offset.
+    """Return the picture, adjusted to the background's brightness and freed of bands of light, and its gain and offset.
 
-    Where `hidden` or `ignored` is above 0, the picture shows nothing of the light; `last` are gain and offset of the
-    one before."""
+    Pixels where `hidden` or `ignored` is above 0 are not used to measure the light; `last` are gain and offset of the
+    picture before."""
     gain, offset = _light(grey, mean, hidden, last, ignored)
     level = ((grey - np.float32(offset)) / np.float32(gain)).astype(np.float32)
     near = hidden
@@ -488,7 +493,7 @@ def _levelled(
         expected = bands * (np.float32(gain) * mean + np.float32(offset))
     white = np.maximum(mean, expected) > WHITE
     if np.any(white):
-        # White is clipped: any value between the background and the expectation fits.
+        # White is clipped: any value between background and expectation fits.
         was, should = mean[white], expected[white]
         off = grey[white] - np.clip(grey[white], np.minimum(was, should), np.maximum(was, should))
         level[white] = was + off / np.float32(gain)
@@ -502,7 +507,7 @@ def _light(
     last: tuple[float, float],
     ignored: NDArray[np.uint8] | None,
 ) -> tuple[float, float]:
-    """The picture's gain and offset against the background."""
+    """Return the picture's gain and offset against the background."""
     rows = max(2, round(BLOCKS * grey.shape[0] / grey.shape[1]))
     now = cv2.resize(grey, (BLOCKS, rows), interpolation=cv2.INTER_AREA).ravel().astype(np.float64)
     was = cv2.resize(mean, (BLOCKS, rows), interpolation=cv2.INTER_AREA).ravel().astype(np.float64)
@@ -515,7 +520,7 @@ def _light(
     if hidden is not None:
         lit = lit & (cv2.resize(hidden, (BLOCKS, rows), interpolation=cv2.INTER_AREA).ravel() == 0)
         gain, offset = last
-        # He may have moved on before most of the rest.
+        # The person may by now be in front of most other blocks.
         fits = lit & (np.abs(now - gain * was - offset) <= FOLLOWS)
     for _ in range(3):
         if np.count_nonzero(fits) < 12:
@@ -531,9 +536,9 @@ def _light(
 
 
 def _bands(grey: _Plane, mean: _Plane, gain: float, offset: float, hidden: NDArray[np.uint8] | None) -> _Plane | None:
-    """The light of each line where it rolls over the picture in bands, as that of mains does; None without bands.
+    """Return each line's gain if light rolls over the picture in bands, as mains lighting does; None without bands.
 
-    `gain` and `offset` explain the picture without bands, which must explain twice as much."""
+    `gain` and `offset` are the best fit without bands; bands must halve its median error."""
     stripes = STRIPES, grey.shape[0]
     now = np.asarray(cv2.resize(grey, stripes, interpolation=cv2.INTER_AREA), np.float32)
     was = np.asarray(cv2.resize(mean, stripes, interpolation=cv2.INTER_AREA), np.float32)
@@ -547,7 +552,7 @@ def _bands(grey: _Plane, mean: _Plane, gain: float, offset: float, hidden: NDArr
     without = float(np.median(np.abs(now - expected)[shown]))
     if without < FAINT:
         return None
-    # What moves seldom fills half of a line's stripes.
+    # Moving things seldom fill half of a line's stripes.
     middle = np.median(now / np.maximum(was, np.float32(DARK)), axis=1)
     light = np.asarray(cv2.blur(middle, (1, 5)), np.float32).reshape(-1, 1)
     bands = light / max(0.1, float(light.mean()))
@@ -569,7 +574,7 @@ class EventTracker:
     """Turns a MotionDetector's results into events, each returned once, at its end."""
 
     def __init__(self, min_duration: float = 0.0) -> None:
-        """Shorter events, in seconds, are left out."""
+        """Leave out events shorter than `min_duration` seconds."""
         self._shortest = min_duration
         self._event: Event | None = None  # the present event, so far
         self._most = 0
@@ -577,12 +582,12 @@ class EventTracker:
 
     @property
     def current(self) -> Event | None:
-        """The present event, so far, once it is long enough."""
+        """The present event so far, once it is long enough."""
         event = self._event
         return event if event is not None and event.end - event.start >= self._shortest else None
 
     def see(self, time: float, seen: Seen) -> Event | None:
-        """Take the result at `time`, which never goes back; return the event that had ended before, if any."""
+        """Take the result for `time`, which must not decrease; return an event that has ended before, if any."""
         ended = self.quiet(time)
         recent = self._first is not None and time - self._first[0] <= MEMORY
         if not seen.moving:
@@ -604,20 +609,20 @@ class EventTracker:
         return ended
 
     def quiet(self, time: float) -> Event | None:
-        """No picture came until `time`: return the event that this ends, if any."""
+        """Take note that there was no picture until `time`; return an event that this ends, if any."""
         if self._event is None or time - self._event.end <= GAP:
             return None
         event, self._event, self._first = self.current, None, None
         return event
 
     def close(self) -> Event | None:
-        """The watch is over: return the unfinished event, if any."""
+        """End the watch; return the unfinished event, if any."""
         event, self._event = self.current, None
         return event._replace(going_on=True) if event is not None else None
 
 
 def around(boxes: tuple[Box, ...]) -> Box:
-    """The box around all; an empty one for none."""
+    """Return the box around all `boxes`; an empty box for none."""
     if not boxes:
         return Box(0, 0, 0, 0)
     left, top = min(box.x for box in boxes), min(box.y for box in boxes)

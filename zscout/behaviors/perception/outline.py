@@ -1,7 +1,8 @@
 """The moving pixels of a picture, at its own resolution and in its colours. Pure.
 
-The detector finds moving regions in a picture of 160 columns, by each pixel's own noise (`motion.py`). In and just
-around them a pixel moves if it differs from a full-resolution background by more than the picture's noise."""
+The detector finds moving regions in a picture of 160 columns, by each pixel's own noise (`motion.py`). In and close to
+these regions, a pixel of the source moves if it differs from a full-resolution background by more than the picture's
+noise."""
 
 from __future__ import annotations
 
@@ -27,14 +28,15 @@ class Outlines:
         self._mean: NDArray[np.float32] = np.empty((0, 0), np.float32)
 
     def learn(self, picture: NDArray[np.uint8], share: float) -> None:
-        """Follow the whole picture by this share, 0 to 1."""
+        """Make the background follow the whole picture by `share`, 0 to 1."""
         if self._mean.shape != picture.shape:
             self._mean = picture.astype(np.float32)
         else:
             cv2.accumulateWeighted(picture, self._mean, share)
 
     def trace(self, picture: NDArray[np.uint8], regions: Mask, share: float) -> Mask:
-        """The moving pixels within `regions` of the reduced picture; the background follows the others by `share`."""
+        """Return the moving pixels within `regions` of the reduced picture; elsewhere the background follows the
+        picture by `share`."""
         height, width = picture.shape[:2]
         if self._mean.shape != picture.shape or not regions.any():
             self.learn(picture, share)

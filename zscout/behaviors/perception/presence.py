@@ -1,7 +1,7 @@
-"""Presence of someone who moved and stopped. Pure.
+"""Presence of a person who moved and stopped. Pure.
 
-A standing person soon counts as noise (`motion.py`). But while the picture where they last moved differs from the one
-before they came, at most LONGEST, something is *present*."""
+A motionless person soon counts as noise (`motion.py`). But something is *present* while the picture, in the area of the
+last motion, differs from the background before that motion, for at most LONGEST."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class Presence:
         self._before = None
 
     def see(self, time: float, level: Plane, mean: Plane, moving: Regions | None, noise: float) -> bool:
-        """Return True if something present does not move. `level`: brightness; `mean`: background."""
+        """Return True if something is present that does not move. `level`: brightness; `mean`: background."""
         if moving is not None:
             if self._before is None:
                 self._before = mean.copy()

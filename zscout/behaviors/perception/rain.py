@@ -1,7 +1,7 @@
 """Rain and snow: many small regions, each in one picture only, all the time. Pure.
 
-A drop is somewhere else in the next picture, a person still covers part of where he was. While it rains, only regions
-count that do so and are larger than the drops, or that are much larger."""
+A drop is elsewhere in the next picture; a person still covers part of their earlier place. While it rains, a region
+counts only if it covers part of its earlier place and is larger than the drops, or if it is much larger."""
 
 from __future__ import annotations
 
@@ -33,7 +33,8 @@ class Rain:
         self._until = self._last = -math.inf
 
     def without_drops(self, time: float, regions: Regions, smallest: float) -> Regions:
-        """The regions that are no drops; all of them without rain. Regions that matter have `smallest` pixels."""
+        """Return the regions that are no drops; all regions without rain. Relevant regions have at least `smallest`
+        pixels."""
         before, self._before, self.drops = self._before, regions, None
         passed, self._last = time - self._last, time
         if OFTEN < passed < math.inf:
@@ -52,7 +53,7 @@ class Rain:
         fresh = counts & (lasts < LASTS * area)
         across, down = PARTS[0] / regions.shape[1], PARTS[1] / regions.shape[0]
         places = {(int(x * across), int(y * down)) for x, y in middles[fresh].tolist()}
-        # Among many people there are always some pieces.
+        # A crowd always shows some small pieces too.
         enough = 2 * np.count_nonzero(fresh) >= np.count_nonzero(counts)
         self.pictures = self.pictures + 1 if enough and len(places) >= FALLS else 0
         if self.pictures > 2:

@@ -1,4 +1,4 @@
-"""Decisions of one robot of a sensor net. Pure: times and pictures in, wheels and words out.
+"""Decisions of one robot of a sensor net. Pure: times and pictures in, wheel speeds and status out.
 
 While held, it first *hides* until it stays in the dark and faces the light, and then *watches* for motion."""
 
@@ -56,7 +56,7 @@ class Alerts:
         return self._last is not None
 
     def see(self, now: float, moving: bool, min_duration: float = 0.0) -> str:
-        """`start` or `end` of an event, else empty. One starts once motion has gone on for `min_duration` seconds."""
+        """`start` or `end` of an event, else empty. An event starts once motion has lasted `min_duration` seconds."""
         if moving:
             first, last = self._spell or (now, now)
             self._spell = now if now - last >= QUIET else first, now

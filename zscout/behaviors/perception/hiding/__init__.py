@@ -1,1 +1,1 @@
-"""How a Scout hides: pictures in, wheel commands out. Pure: no clock, no thread, no I/O."""
+"""Hiding of a Scout: pictures in, wheel commands out. Pure: no clock, no thread, no I/O."""

@@ -40,7 +40,8 @@ class Turn(NamedTuple):
 
 
 def strip_and_tones(picture: Picture) -> tuple[Strip, Tones]:
-    """The strip for `turned`, in whole numbers that a checkpoint keeps exactly, and the plain tones for `brighter`."""
+    """Return the strip for `turned`, as integers that a checkpoint keeps exactly, and the plain tones for
+    `brighter`."""
     by_angle = _by_angle(picture[_TOP:_BOTTOM])
     return _off_the_mean(by_angle, (_SLOW, 1)), np.rint(by_angle).astype(np.uint8)
 
@@ -60,7 +61,8 @@ def brighter(old: Tones, new: Tones, angle: float) -> float:
 
 
 def floor_strip(picture: Picture) -> Strip:
-    """The near floor's grain, laid out alike: unchanged by turns on the spot and vain pushes only."""
+    """Return a strip of the near floor's texture. It stays the same only if the robot turns on the spot or pushes
+    against something without moving."""
     return _off_the_mean(cv2.blur(_by_angle(picture[_NEAR:]), (3, 1)), (25, 7))
 
 
@@ -75,7 +77,7 @@ def _off_the_mean(levels: NDArray[Any], around: tuple[int, int]) -> Strip:
 
 
 def turned(old: Strip, new: Strip, expected: float = 0.0, spread: float = math.radians(40)) -> Turn:
-    """The turn that best makes `old` into `new`, in whole columns (0.4 degrees).
+    """Return the turn that best maps `old` to `new`, in whole columns (0.4 degrees).
 
     The search prefers `expected` (radians): `spread` away, a turn must correlate better by 0.15."""
     after, before = new.astype(np.float32), old.astype(np.float32)

@@ -2,7 +2,7 @@
 
 This is the paper's Place Sensor Net, per robot: locate the dark place, servo to it, handle collisions, turn to the
 light. Without odometry, turns are measured in the pictures (`compass`), drives dead-reckoned and corrected by sight.
-Call `see(now, picture)` at every picture, with None if there is no new one. All memory is in one `HidingState`."""
+Call `see(now, picture)` regularly, with None if there is no new picture. All memory is in one `HidingState`."""
 
 from __future__ import annotations
 
@@ -99,7 +99,7 @@ class Hider:
         stuck = drove and robot.blocked_by(picture)
         step = (phase.stuck if stuck else phase.step)(robot, view)
         while not isinstance(step, WheelCommand):
-            # The next phase takes its first step on the same picture.
+            # The next phase uses the same picture for its first step.
             self._go(step)
             step = PHASES[step].step(robot, view)
         return step
@@ -118,7 +118,7 @@ class Hider:
         return passed
 
     def _blind(self, how: str) -> WheelCommand:
-        """Without a usable picture (`how` it is spoiled, if any) the last command runs out, then the robot stops."""
+        """Without a usable picture, let the last command run out, then stop. `how`: the defect of a spoiled picture."""
         robot = self._robot
         if how:
             robot.spoiled_how = how
@@ -151,7 +151,7 @@ class Hider:
         self._go(RESUMES.get(robot.phase, "scan"))
 
     def checkpoint(self) -> bytes:
-        """All memory; a hider from `restore` behaves exactly the same."""
+        """Return all memory; a hider from `restore` behaves exactly the same."""
         return msgspec.msgpack.encode(self._robot)
 
     @classmethod

@@ -57,14 +57,14 @@ def begin_scan(robot: HidingState) -> None:
 
 
 def scan(robot: HidingState, view: View) -> Step:
-    """A full turn in steps; then choose the best dark place."""
+    """Make a full turn in hops, then choose the best dark place."""
     robot.sight(view)
     if abs(robot.turned) < FULL_TURN and robot.hops < MOST_HOPS:
         degrees, seen = math.degrees(abs(robot.turned)), len(robot.sightings)
         return robot.hop(HOP, f"looks around, {degrees:.0f} degrees, {seen} dark seen")
     share, roof = shelter(robot.openings)
     if roof and share <= DARKISH:
-        # Beneath something already, if maybe not deep enough.
+        # The robot is beneath something already, but maybe not deep enough.
         robot.faces = 1
         return to_light(robot)
     target = robot.target = best(robot)
@@ -78,7 +78,7 @@ def scan(robot: HidingState, view: View) -> Step:
 
 
 def worth(sighting: Sighting, memory: HidingState) -> float:
-    """How promising a dark place is, 0 for useless. Wide, low, dark and near is best."""
+    """Rate a dark place, 0 for useless. Wide, low, dark and near is best."""
     if sighting.darkness > 0.5 or sighting.width < 0.2:
         return 0.0
     if any(distance(spot, sighting) < BAD_NEAR + 0.15 * sighting.distance for spot in memory.bad):
@@ -120,7 +120,7 @@ def begin_roam(robot: HidingState) -> None:
 
 
 def roam(robot: HidingState, _: View) -> Step:
-    """No dark place in view: drive to the most open side, or the next if that is blocked."""
+    """Drive to the most open side, or the next if that is blocked."""
     if robot.next_phase == "roam":
         return "aim"
     if robot.cruised(robot.left_to_go):
@@ -135,7 +135,7 @@ def roam_stuck(robot: HidingState, _: View) -> Step:
 
 
 def most_open(robot: HidingState) -> Opening:
-    """The most open side of the scan, away from blocked ones, with a little chance."""
+    """Return the most open side of the scan, away from blocked sides, slightly randomized."""
     best, most = Opening(robot.heading + math.pi, 0.5, 0, 0, 0, 0, 0), -99.0
     for side in robot.openings:
         value = min(side.open_for, 2.5) + 0.6 * robot.roll()
@@ -188,7 +188,7 @@ def dodge(robot: HidingState, view: View) -> Step:
 
 
 def side_of(robot: HidingState, view: View) -> int:
-    """1 left, -1 right: at an edge towards the darker side, else in turns."""
+    """Return 1 for left, -1 for right: at an edge the darker side, else both alternately."""
     left, right = view.sides
     if robot.at_edge and max(left, right) > 1.5 * min(left, right):
         return 1 if left < right else -1
@@ -196,14 +196,14 @@ def side_of(robot: HidingState, view: View) -> int:
 
 
 def leave(robot: HidingState, _: View) -> Step:
-    """Out of a bad place, towards the light."""
+    """Drive out of a bad place, towards the light."""
     if robot.cruised(0.6):
         return "scan"
     return robot.cruise(robot.pace, 0.0, f"{robot.note}: leaves")
 
 
 def approach(robot: HidingState, view: View) -> Step:
-    """Drive with the place ahead, re-centred at every picture."""
+    """Drive towards the place, correcting the course at every picture."""
     target = robot.target
     if target is None:
         return "scan"
@@ -236,7 +236,7 @@ def approach(robot: HidingState, view: View) -> Step:
 
 
 def match(view: View, expected: float, distance: float) -> DarkPlace | None:
-    """The place of this picture most like the expected one."""
+    """Return the place in this picture that matches the expected bearing and distance best."""
     found, least = None, 1.0
     for place in view.places:
         # Radians from the bearing to the nearest part of the place.
@@ -248,7 +248,7 @@ def match(view: View, expected: float, distance: float) -> DarkPlace | None:
 
 
 def aim_at(place: DarkPlace, expected: float) -> float:
-    """The nearest part of the place to the present course, away from its ends, where feet stand."""
+    """Return the bearing to the part of the place nearest to the course, away from its ends with their feet."""
     margin = min(0.45 * place.width, 0.28)
     # The place continues where the picture cuts it off.
     left = place.width / 2 - (margin if place.left > 1 else 0.05)
@@ -266,7 +266,7 @@ def begin_enter(robot: HidingState) -> None:
 
 
 def enter(robot: HidingState, view: View) -> Step:
-    """Straight into the dark, by a few lengths of the body."""
+    """Drive straight into the dark, by a few lengths of the body."""
     if robot.cruised(robot.left_to_go):
         return enter_stuck(robot, view)
     return robot.cruise(robot.pace, 0.0, "drives in")
@@ -287,7 +287,7 @@ def begin_face(robot: HidingState) -> None:
 
 
 def face(robot: HidingState, view: View) -> Step:
-    """A full turn in the dark; then to the side with most lit floor."""
+    """Make a full turn in the dark, then face the side with most lit floor."""
     robot.sight(view)
     if abs(robot.turned) < FULL_TURN and robot.hops < FACE_HOPS:
         return robot.hop(HOP, "in the dark, looks for the light")
@@ -302,14 +302,15 @@ def to_light(robot: HidingState) -> Step:
 
 
 def shelter(openings: list[Opening]) -> tuple[float, bool]:
-    """From a full turn: near floor over lit floor, and whether the top is dark on most sides, as beneath a sofa."""
+    """Return the ratio of near to lit floor over a full turn, and True if the top is dark on most sides, as beneath a
+    sofa."""
     lit = max(side.outside for side in openings)
     near, above = np.percentile([(side.near, side.above) for side in openings], 75, axis=0).tolist()
     return near / max(lit, 1e-4), above <= ROOFED * lit
 
 
 def lightest(openings: list[Opening]) -> Opening:
-    """The direction with most lit floor, neighbours included, each side once."""
+    """Return the direction with most lit floor, averaged with its neighbours."""
 
     def value(side: Opening) -> float:
         beside = [max(0.0, 1 - abs(wrapped(other.heading - side.heading)) / 0.9) for other in openings]
@@ -319,7 +320,7 @@ def lightest(openings: list[Opening]) -> Opening:
 
 
 def settle(robot: HidingState, view: View) -> Step:
-    """Facing the light, check that it is dark here and lit there."""
+    """Facing the light, check that the robot's place is dark and its view lit."""
     if robot.shifted:
         # It moved: check again.
         return "face"

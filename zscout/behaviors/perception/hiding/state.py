@@ -47,7 +47,7 @@ PHASES_OF: Final[dict[str, tuple[Phase, ...]]] = {
     "unstick": ("back", "dodge", "leave"),
     "hidden": ("hidden", "check"),
 }
-"""By the words that people see."""
+"""Phases by the state that people see."""
 WORDS: Final = {phase: word for word, phases in PHASES_OF.items() for phase in phases}
 
 
@@ -105,7 +105,7 @@ class Thumb(msgspec.Struct, frozen=True):
 
 
 class HidingState(msgspec.Struct):
-    """See the module. Arrays are kept as bytes."""
+    """All memory of a hider; see the module. Arrays are kept as bytes."""
 
     form: int = FORM
     phase: Phase = "scan"
@@ -184,7 +184,7 @@ class HidingState(msgspec.Struct):
         return self.act(0.0, 0.0, 0.0, why)
 
     def rest(self, why: str) -> WheelCommand:
-        """Nothing new: the last command runs out by itself."""
+        """Let the last command run out: return it with its remaining time."""
         lasts = self.ends - self.clock
         if lasts > 0.01:
             return WheelCommand(self.left, self.right, lasts, self.word, why)
@@ -208,7 +208,7 @@ class HidingState(msgspec.Struct):
         return self.x + distance * math.cos(heading), self.y + distance * math.sin(heading)
 
     def hop(self, angle: float, why: str) -> WheelCommand:
-        """Turn on the spot by `angle`, at most `LONGEST_HOP`; the rest is for the next hop."""
+        """Turn on the spot by `angle`, at most `LONGEST_HOP`; the remainder needs further hops."""
         angle = max(-LONGEST_HOP, min(LONGEST_HOP, angle))
         speed = 0.5 if abs(angle) > 0.25 else 0.3
         wheel = math.copysign(speed, angle)
@@ -263,7 +263,7 @@ class HidingState(msgspec.Struct):
 
     @property
     def pace(self) -> float:
-        """Metres per second that suit the rate of pictures."""
+        """Speed, in metres per second, that suits the rate of pictures."""
         return min(0.24, 0.07 / self.interval)
 
     def cruised(self, least: float) -> bool:
