@@ -192,7 +192,7 @@ async def test_frames_tell_what_of_their_motion_is_reported() -> None:
     limits = MotionLimits([[0, 0, 0.4, 0.1]], min_duration=2)
     with MjpegServer() as server:
         async with grabbing(server.url, motion=limits) as (driver, rc):
-            await until(lambda: not driver._lost)
+            await until(lambda: not driver._unwell)
             await driver.begin(holder(1, "look"))
             await until(lambda: bool(rc.heads))
             assert rc.heads[0].motion == limits
@@ -202,7 +202,7 @@ async def test_frames_tell_what_of_their_motion_is_reported() -> None:
 async def test_a_frozen_source_ends_no_hold_and_is_in_frames_and_figures() -> None:
     with MjpegServer(picture=lambda _: jpeg(numbered(5))) as server:
         async with grabbing(server.url, still_after=1.0, picture_within=30.0) as (driver, rc):
-            await until(lambda: not driver._lost)
+            await until(lambda: not driver._unwell)
             await driver.begin(holder(1, "look"))
             await until(lambda: bool(rc.heads) and rc.heads[-1].frozen >= 1)
             assert driver.figures()["frozen_seconds"] >= 1

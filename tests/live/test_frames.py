@@ -337,9 +337,9 @@ async def test_tuning_by_hand(tmp_path: Path) -> None:
 async def test_a_source_that_falls_silent_loses_the_framegrabber_until_it_is_back(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(framegrabber, "LOST_AFTER", 2.0)
+    monkeypatch.setattr(framegrabber, "UNWELL_AFTER", 2.0)
     async with scene(tmp_path) as at:
-        monkeypatch.setattr(framegrabber, "TRY_NEXT", 600)
+        monkeypatch.setattr(framegrabber, "TRY_NEXT_AFTER", 600)
         arc, grant = await running(at.client, "hide", GRABBER, "video/ch1")
         # Whether or not somebody looks: whoever holds it may be about to.
         await until(lambda: at.driver._capture is not None and at.driver._capture.number > 0)
@@ -363,7 +363,7 @@ async def test_a_source_that_falls_silent_loses_the_framegrabber_until_it_is_bac
         assert at.rc.health == "ok"
 
         # With several sources it is there for others as soon as any of them works.
-        monkeypatch.setattr(framegrabber, "TRY_NEXT", 0.3)
+        monkeypatch.setattr(framegrabber, "TRY_NEXT_AFTER", 0.3)
         at.one.close()
         await until(lambda: arc.state == "queued")
         await at.client.end(arc)

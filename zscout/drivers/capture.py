@@ -1,8 +1,8 @@
 """The newest picture of any source that OpenCV can open: a device, a file, or a URL.
 
-OpenCV hands out pictures in order, however old they are: a reader that is too slow falls behind without end. So a
-thread of its own reads all of them and keeps only the newest. It opens its source again whenever that fails, and
-describes its state in words."""
+OpenCV returns pictures in order, however old they are: a slow reader falls further and further behind. So a thread
+reads all of them and keeps only the newest. It reopens its source whenever that fails, and describes its state in
+`health`."""
 
 from __future__ import annotations
 
@@ -33,45 +33,45 @@ log = logging.getLogger(__name__)
 PAUSES: Final = (0.2, 2.0)
 """Seconds between two attempts to open a source: the first, and the longest."""
 MAX_PIXELS: Final = 1 << 24
-"""Of one picture; larger ones count as a failure of the source."""
+"""Largest picture. Larger pictures count as a failure of the source."""
 FILE_RATE: Final = 25.0
-"""Pictures a second of a file without a rate, or with one beyond belief."""
+"""Pictures a second of a file without a rate, or with a rate outside FILE_RATES."""
 FILE_RATES: Final = (0.1, 240.0)
 STALLED: Final = 0.8
-"""A read that failed after this share of its timeout ran into it; one that failed sooner was cut off."""
+"""A read that fails after this part of its timeout has timed out; if it fails sooner, the source was cut off."""
 MISSES: Final = 3
-"""Reads in a row that may fail: FFmpeg gives up a picture that it can't make out, and reads on."""
+"""This many failed reads in a row end a source: FFmpeg skips single pictures that it can't decode."""
 STILL_AFTER: Final = 10.0
-"""Seconds of pictures that are all the same after which a camera counts as frozen: sensors have noise."""
+"""A camera counts as frozen after this many seconds of identical pictures, because sensors have noise."""
 OPTIONS: Final = "OPENCV_FFMPEG_CAPTURE_OPTIONS"
 ASKING: Final = 2.0
-"""Seconds that a camera's server may take to say why it gives no pictures."""
+"""Seconds for a camera's server to answer why it sends no pictures."""
 EXIT_WAIT: Final = 2.5
-"""Seconds that the end of the process waits for threads that OpenCV holds up: longer than their timeouts."""
+"""Seconds that the exit of the process waits for threads inside OpenCV: longer than their timeouts."""
 
 _URL = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*://")
 
 
 @dataclass(frozen=True, slots=True)
 class CapturedFrame:
-    """One picture. `number` counts from 1 and goes on when the source is opened again; `time` is when it was read, in
-    seconds of this host's own clock; `picture` is uint8, (height, width) or (height, width, 3) BGR."""
+    """One picture. `number` counts from 1, also over reopenings of the source. `time`: when it was read, in seconds of
+    this host's clock. `picture`: uint8, (height, width) or (height, width, 3) BGR."""
 
     number: int
     time: float
     picture: NDArray[np.uint8]
     frozen: float = 0.0
-    """For how many seconds all have been like this one, if the source counts as frozen by that."""
+    """For how many seconds all pictures have been identical, if the source counts as frozen; else 0."""
 
 
 class Capture:
     """Reads one source in a thread of its own, until `stop`.
 
-    `source` is a device (`/dev/video0`, or its number), a URL (`http://`, `rtsp://`, ...) or else a file, which is read
-    at its own rate, and from its start again when it ends. `open_timeout` and `read_timeout` are seconds; a source that
-    gives no picture for `read_timeout` is opened again. `still_after`: seconds of the same picture, to the last bit,
-    after which it is `frozen`; 0: never; None: STILL_AFTER for all but files. `transport` of RTSP: tcp or udp. All
-    attributes may be read from any thread."""
+    `source` is a device (`/dev/video0`, or its number), a URL (`http://`, `rtsp://`, ...) or a file, which is read at
+    its own rate and repeated. `open_timeout` and `read_timeout` are in seconds; a source without a picture for
+    `read_timeout` is reopened. `still_after`: seconds of bitwise identical pictures after which it is `frozen`; 0:
+    never; None: STILL_AFTER, and never for files. `transport` of RTSP: tcp or udp. All attributes can be read from any
+    thread."""
 
     def __init__(
         self,
@@ -85,19 +85,19 @@ class Capture:
         self.source = source
         self.kind = kind_of(source)
         self.failed = False
-        """Whether its source could not be opened, or gives no pictures any more."""
+        """True if the source could not be opened, or no longer gives pictures."""
         self.health = "not open yet"
-        """`ok` while pictures come; or in words what is wrong, without passwords that are in a URL."""
+        """`ok` while pictures come; otherwise the fault as text, without passwords of a URL."""
         self.number = 0
-        """Of the newest picture; 0 while there was none."""
+        """Number of the newest picture; 0 before the first."""
         self.opened = 0
         """How often the source was opened."""
         self.dropped = 0
-        """Pictures that a newer one replaced before anybody looked at them."""
+        """Pictures that a newer picture replaced before they were read."""
         self.frozen = 0.0
-        """For how many seconds its pictures have all been the same; 0 while that is less than `still_after`."""
+        """For how many seconds its pictures have been identical; 0 while that is less than `still_after`."""
         self.stalls = 0
-        """How often an open source gave nothing for `read_timeout`."""
+        """How often an open source gave no picture for `read_timeout`."""
         self._open_timeout, self._read_timeout = open_timeout, read_timeout
         self._still_after = (0.0 if self.kind == "file" else STILL_AFTER) if still_after is None else still_after
         self._same_since = 0.0
@@ -107,14 +107,14 @@ class Capture:
         self._newest: CapturedFrame | None = None
         self._taken = True
         self._due = 0.0
-        # A daemon: a process that ends need not wait for ever until OpenCV has given up.
+        # A daemon, so that the process can exit without waiting until OpenCV gives up.
         self._thread = threading.Thread(target=self._run, name=f"capture {shown(source)}"[:60], daemon=True)
         self._thread.start()
         _LIVING.add(self)
 
     def stop(self, wait: float = 1.0) -> None:
-        """Ends the reading, and waits at most `wait` seconds for it: a thread that OpenCV holds up ends by
-        itself at the source's timeout."""
+        """Stop reading, and wait at most `wait` seconds for the thread. If it is blocked in OpenCV, it ends at the
+        source's timeout."""
         self._stop.set()
         with self._new_picture:
             self._new_picture.notify_all()
@@ -122,12 +122,12 @@ class Capture:
 
     @property
     def alive(self) -> bool:
-        """Whether the thread runs, be it only until OpenCV lets go of it."""
+        """True while the thread runs; after `stop`, while it is blocked in OpenCV."""
         return self._thread.is_alive()
 
     def wait(self, after: int, timeout: float) -> CapturedFrame | None:
-        """The newest picture with a number above `after`, as soon as there is one; None if none came within
-        `timeout` seconds, or when the capture was stopped."""
+        """Wait for a picture with a number above `after`, and return the newest; None if none came within `timeout`
+        seconds, or if the capture was stopped."""
         with self._new_picture:
             self._new_picture.wait_for(lambda: self.number > after or self._stop.is_set(), timeout)
             if self._stop.is_set() or self.number <= after:
@@ -153,7 +153,7 @@ class Capture:
             pause = min(2 * pause, PAUSES[1])
 
     def _read_all(self) -> None:
-        """Opens the source, and reads it until it fails or ends."""
+        """Open the source, and read it until it fails or ends."""
         began = seconds()
         with _TRANSPORT.of(self._transport, self.source):
             video = _open(self.source, self.kind, self._open_timeout, self._read_timeout)
@@ -169,7 +169,7 @@ class Capture:
             misses = 0
             while not self._stop.is_set():
                 if period and not misses:
-                    # After a stall it goes on from there, rather than rush through what it missed.
+                    # After a stall, continue at the normal rate instead of catching up.
                     self._due = max(self._due + period, seconds())
                     if self._stop.wait(max(0.0, self._due - seconds())):
                         return
@@ -216,7 +216,7 @@ class Capture:
             self._new_picture.notify_all()
 
     def _ended(self, video: cv2.VideoCapture, waited: float, *, pictures: int) -> None:
-        """A source that was open gives no more pictures."""
+        """An open source gives no more pictures: set `health`."""
         name = shown(self.source)
         if codec := self.number == 0 and UNDECODABLE.get(_codec(video)):
             self._set_health(f"{name} sends {codec}, which can't be decoded here; {REMEDY}")
@@ -226,7 +226,7 @@ class Capture:
         elif waited >= STALLED * self._read_timeout:
             self.stalls += 1
             self._set_health(f"no picture from {name} for {self._read_timeout:g} s")
-        elif pictures != 1:  # a camera of stills is opened for each
+        elif pictures != 1:  # a still camera is reopened for each picture
             self._set_health(f"{name} was cut off")
 
     def _why_closed(self, waited: float) -> str:
@@ -260,7 +260,7 @@ _LIVING: weakref.WeakSet[Capture] = weakref.WeakSet()
 
 @atexit.register
 def _stop_all() -> None:
-    """A thread that comes out of OpenCV while the interpreter goes down would abort the process."""
+    """Stop all captures: a thread that returns from OpenCV during interpreter shutdown would abort the process."""
     captures = list(_LIVING)
     for capture in captures:
         capture.stop(0)
@@ -270,8 +270,8 @@ def _stop_all() -> None:
 
 
 class _Transport:
-    """OpenCV takes the transport of RTSP from the environment alone, as it opens: sources of one transport are opened
-    side by side, those of another in turn."""
+    """OpenCV reads the transport of RTSP only from the environment, when it opens a source. So sources with the same
+    transport are opened in parallel, and sources with different transports in turn."""
 
     def __init__(self) -> None:
         self._turn = threading.Lock()
@@ -289,7 +289,7 @@ class _Transport:
             if transport != self._now:
                 if transport == "udp":
                     self._given = os.environ.get(OPTIONS)
-                    # With the last, FFmpeg itself falls back to TCP.
+                    # With `udp+tcp`, FFmpeg itself falls back to TCP.
                     os.environ[OPTIONS] = f"{self._given or 'fflags;discardcorrupt'}|rtsp_transport;udp+tcp"
                 elif self._given is not None:
                     os.environ[OPTIONS] = self._given
@@ -309,14 +309,14 @@ _TRANSPORT: Final = _Transport()
 
 
 def kind_of(source: str) -> Literal["device", "file", "url"]:
-    """What a source is, by its form alone."""
+    """The kind of a source, by its spelling alone."""
     if (source.isascii() and source.isdigit()) or source.startswith("/dev/"):
         return "device"
     return "url" if _URL.match(source) else "file"
 
 
 def shown(source: str) -> str:
-    """A source as it may be shown and logged: a URL without user, password and query, where secrets are."""
+    """Return a source for messages and logs: a URL without user, password and query, which may be secret."""
     if kind_of(source) != "url":
         return source
     try:
@@ -330,15 +330,15 @@ def shown(source: str) -> str:
 
 
 def is_utf8(name: str) -> bool:
-    """Whether OpenCV may be given this name: it ends the process at one with other bytes."""
+    """Return True if the name is valid UTF-8. OpenCV aborts the process at other names."""
     return not any("\ud800" <= char <= "\udfff" for char in name)
 
 
 def _open(source: str, kind: str, open_timeout: float, read_timeout: float) -> cv2.VideoCapture:
-    # These are read when a backend is first used. FFmpeg would complain about every torn picture on the
-    # node's own stderr (-8: quiet), and hands out half a picture as a whole one unless set to discard it
-    # (TCP for RTSP is what OpenCV itself asks for). Without OpenCV's lock around it one silent server held up
-    # the opening of all other sources; FFmpeg has needed none since 4.0.
+    # These variables are read when a backend is first used. -8: quiet, as FFmpeg would log every torn picture on the
+    # node's stderr. discardcorrupt: FFmpeg would return half pictures as whole ones. rtsp_transport;tcp: OpenCV's own
+    # default. THREAD_SAFE: with OpenCV's lock, one silent server blocks the opening of all other sources; FFmpeg needs
+    # no lock since 4.0.
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
     os.environ.setdefault(OPTIONS, "rtsp_transport;tcp|fflags;discardcorrupt")
     os.environ.setdefault("OPENCV_FFMPEG_IS_THREAD_SAFE", "1")
@@ -349,7 +349,7 @@ def _open(source: str, kind: str, open_timeout: float, read_timeout: float) -> c
         return cv2.VideoCapture()
     if kind == "device":
         return cv2.VideoCapture(str(_device_path(source)), cv2.CAP_V4L2)
-    # One thread to decode: several would each hold a picture back.
+    # One decoding thread: each further thread would delay pictures by one.
     options: list[Any] = [cv2.CAP_PROP_N_THREADS, 1]
     if kind == "url":
         options += [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, round(1000 * open_timeout)]
@@ -358,7 +358,7 @@ def _open(source: str, kind: str, open_timeout: float, read_timeout: float) -> c
 
 
 def _same(picture: NDArray[np.uint8], other: NDArray[np.uint8]) -> bool:
-    """Return True if two pictures are the same to the last bit. A few of their pixels settle it for most."""
+    """Return True if two pictures are bitwise identical. For most pictures a few pixels suffice."""
     few = slice(None, None, 16)
     return (
         picture.shape == other.shape
@@ -383,5 +383,5 @@ def _file_period(video: cv2.VideoCapture) -> float:
 
 
 def seconds() -> float:
-    """This host's own clock, in seconds."""
+    """The time by this host's clock, in seconds."""
     return clock.now() / SECOND

@@ -1,9 +1,8 @@
 """A framegrabber: pictures of an OpenCV source, published as JPEG while it is held and has subscribers.
 
-It is tuned to the video RC that is in the gang of its holder. Three things happen side by side: a capture reads the
-source (`capture.py`), a pump encodes and publishes in a thread of its own, and the event loop supervises both: a
-framegrabber that has no picture as its node begins, or for LOST_AFTER while it is held, reports itself lost, goes on
-trying, and is back with the first picture."""
+It is tuned to the video RC in its holder's gang. A capture thread reads the source (`capture.py`), a pump thread
+encodes and publishes, and the event loop supervises both. Without a picture when its node starts, or for UNWELL_AFTER
+while it is held, a framegrabber reports itself unwell, keeps trying, and recovers with the first picture."""
 
 from __future__ import annotations
 
@@ -36,26 +35,25 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-LOST_AFTER: Final = 5.0
-"""Seconds without a picture after which a framegrabber that is held is lost; a slow source has longer."""
-TRY_NEXT: Final = 5.0
-"""Seconds that a lost framegrabber tries one of several sources, likewise."""
+UNWELL_AFTER: Final = 5.0
+"""Seconds without a picture after which a held framegrabber is unwell; longer for a slow source."""
+TRY_NEXT_AFTER: Final = 5.0
+"""Seconds for each source while a framegrabber without pictures tries several; longer for a slow source."""
 PICTURE_WITHIN: Final = 1.5
 OPEN_TIMEOUT: Final = 2.0
 OPENING: Final = 1.0
-"""Seconds that a node waits for a first picture before it offers the RC as lost."""
-LOOK: Final = 0.02
-CHECK: Final = 0.2
-"""Seconds from one look at the source to the next."""
+"""Seconds that a node waits for a first picture before it offers the RC as unwell."""
+POLL_S: Final = 0.02
+CHECK_PERIOD_S: Final = 0.2
+"""Between two checks of the source."""
 MAX_AGE: Final = 1.0
-"""Seconds; an older picture is not published as if it were new."""
+"""Seconds; older pictures are not published."""
 FRAME_WAIT: Final = 0.25
-"""Seconds from one look at whether it should stop to the next, where no pictures come."""
+"""Seconds between two checks whether to stop, while no pictures come."""
 EARLY: Final = Fraction(1, 2)
-"""Share of the interval between two frames by which one may come early."""
+"""Part of the interval between two frames by which a frame may come early."""
 GREY: Final = 3
-"""Difference of the colours up to which a picture is grey: what decoding makes of a grey picture that was
-coded in colour."""
+"""Largest difference between the colours of a grey picture, which may have been coded in colour."""
 MEASURED: Final = 64
 """Frames over which the latency is measured."""
 RATE_SPAN: Final = 3.0
@@ -63,12 +61,12 @@ RATE_SPAN: Final = 3.0
 
 
 class FramegrabberDriver(Driver):
-    """`sources` are what `Capture` takes, by the video RC that each shows; {"": source} where there is only
-    one, whatever it shows. At most `rate` frames a second are published, with JPEG `quality` 1..100. `picture_within`:
-    seconds from one picture to the next at most; `still_after` and `transport` as `Capture` takes them. `motion`: sent
-    with each frame, for whoever detects motion in it.
+    """`sources`: sources for `Capture`, by the video RC that each shows; {"": source} for a single source of any
+    channel. At most `rate` frames a second are published, with JPEG `quality` 1..100. `picture_within`: seconds from
+    one picture to the next at most; `still_after` and `transport` as in `Capture`. `motion`: sent with each frame, for
+    motion detectors.
 
-    Commands: `tune` (`to`: a video RC, where the gang does not settle it), `snapshot` (its present state)."""
+    Commands: `tune` (`to`: a video RC, if the gang leaves it open), `snapshot` (the present state)."""
 
     Options = FramegrabberRc
 
@@ -89,27 +87,27 @@ class FramegrabberDriver(Driver):
         self._receives = ", ".join(sorted(sources))
         self._rate, self._quality, self._motion = rate, quality, motion
         self._slow = 2 * picture_within if picture_within > PICTURE_WITHIN else 0.0
-        # Before it gives the first, FFmpeg looks at three pictures.
+        # FFmpeg reads three pictures before it returns the first.
         opening = max(OPEN_TIMEOUT, 2 * self._slow)
         self._capturing = partial(
             Capture, open_timeout=opening, read_timeout=picture_within, still_after=still_after, transport=transport
         )
         self._faults: dict[str, str] = {}
-        """Of each source that failed: the newest reason."""
+        """The newest failure by source."""
         self._meter = FrameMeter()
         self._holder: Holder | None = None
         self._source: str | None = None
-        """Of `sources`: to what it is tuned."""
+        """The key of `sources` to which it is tuned."""
         self._untuned = ""
-        """Why it is tuned to nothing while it is held."""
+        """Why it is held, but not tuned."""
         self._capture: Capture | None = None
         self._pump: FramePump | None = None
         self._watching: asyncio.Task[None] | None = None
         self._silent = 0.0
-        """Seconds without a picture while it was open and this process awake, since the hold began."""
-        self._lost = False
+        """Seconds without a picture since the hold began, without stalls of this process."""
+        self._unwell = False
         self._before: Counter[str] = Counter()
-        """What the captures have counted that were let go."""
+        """The counts of former captures."""
 
     @classmethod
     def configured(cls, options: Any) -> Self:
@@ -131,14 +129,14 @@ class FramegrabberDriver(Driver):
         await self._try_sources()
 
     async def _try_sources(self) -> None:
-        """Opens its sources until one has a picture. Where none has, it is lost from the beginning."""
-        end, self._lost = seconds() + OPENING, True
+        """Open the sources until one has a picture. Without any it is unwell from the start."""
+        end, self._unwell = seconds() + OPENING, True
         for source in sorted(self._sources):
             capture = self._open(source)
-            while capture.number == 0 and not capture.failed and seconds() < end:  # noqa: ASYNC110 - a thread's
-                await asyncio.sleep(LOOK)
+            while capture.number == 0 and not capture.failed and seconds() < end:  # noqa: ASYNC110 - set by a thread
+                await asyncio.sleep(POLL_S)
             if capture.number:
-                self._lost = False
+                self._unwell = False
                 self._close_unless_needed()
                 self._before.clear()
                 return
@@ -151,7 +149,7 @@ class FramegrabberDriver(Driver):
         self._rc.unwell(f"no picture{about}: {'; '.join(self._faults.values())}")
 
     async def close(self) -> None:
-        self._lost = False
+        self._unwell = False
         capture, pump = self._capture, self._pump
         self._let_go()
         if pump is not None:
@@ -166,7 +164,7 @@ class FramegrabberDriver(Driver):
         if source is None:
             log.warning("%s: held by %s, but %s", self._rc.name, holder.arc, self._untuned)
             self._stop_pump()
-            if not self._lost:
+            if not self._unwell:
                 self._let_go()
         else:
             self._tune(source, holder)
@@ -187,8 +185,8 @@ class FramegrabberDriver(Driver):
                 return await super().command(holder, do)
 
     def figures(self) -> Figures:
-        """Rates are per second, over the last 3 s; latency is from reading a picture to its publication, the
-        median of the last 64; `dropped`, `opened` and `stalls` count since the node began."""
+        """Rates are per second, over the last 3 s. Latency is from reading a picture to its publication, the median of
+        the last 64. `dropped`, `opened` and `stalls` count since the node started."""
         totals, meter = self._totals(), self._meter
         return {
             "frames_per_second": round(meter.rate(seconds()), 1),
@@ -214,7 +212,7 @@ class FramegrabberDriver(Driver):
     # Tuning
 
     def _of_gang(self, rcs: list[str]) -> tuple[str | None, str]:
-        """The source that a gang settles, or why it settles none."""
+        """Return the source that a gang determines, or None and the reason."""
         if "" in self._sources:
             return "", ""
         videos = [rc for rc in rcs if rc.startswith("video/")]
@@ -238,7 +236,7 @@ class FramegrabberDriver(Driver):
         return to
 
     def _tune(self, source: str, holder: Holder) -> None:
-        """Publishes pictures of this source from now on, under the grant of `holder`."""
+        """Publish pictures of this source under the grant of `holder`."""
         self._stop_pump()
         self._untuned, self._silent = "", 0.0
         capture = self._capture
@@ -260,7 +258,7 @@ class FramegrabberDriver(Driver):
         return capture
 
     def _let_go(self) -> None:
-        """Stops reading. The capture's thread ends by itself: nobody waits for it here."""
+        """Stop reading. The capture's thread ends by itself, without waiting here."""
         self._stop_pump()
         if self._capture is not None:
             self._capture.stop(0)
@@ -273,43 +271,43 @@ class FramegrabberDriver(Driver):
         self._pump = None
 
     def _close_unless_needed(self) -> None:
-        """A source stays open while the framegrabber is held, and afterwards while it has subscribers: the
-        next holder has its picture at once. A lost one stays open to be found again."""
-        if self._holder is None and not self._publisher.watched and not self._lost:
+        """Close the source unless the framegrabber is held or unwell, or has subscribers: then the next holder has its
+        picture at once."""
+        if self._holder is None and not self._publisher.watched and not self._unwell:
             self._let_go()
 
     async def _watch_over(self) -> None:
-        """Reports the RC lost, and back, by the pictures that come."""
+        """Report the RC unwell without pictures, and recovered when they return."""
         seen, last = (self._capture, 0), seconds()
         while (capture := self._capture) is not None:
             now, newest = seconds(), (capture, capture.number)
             if newest == seen:
-                # Where this process stood still, its capture did so too, through no fault of the source.
-                self._silent += min(now - last, 2 * CHECK)
+                # If this process stalled, its capture did too: the source is not at fault.
+                self._silent += min(now - last, 2 * CHECK_PERIOD_S)
             else:
                 self._silent = 0.0
-                if self._lost and capture.number > 0:
-                    self._lost = False
+                if self._unwell and capture.number > 0:
+                    self._unwell = False
                     self._faults.clear()
                     self._rc.recover()
                     self._close_unless_needed()
             seen, last = newest, now
-            if self._lost:
+            if self._unwell:
                 name = self._source or ""
                 if capture.failed and self._faults.get(name) != capture.health:
                     self._faults[name] = capture.health
                     self._fail()
-                if self._silent > max(TRY_NEXT, self._slow) and self._holder is None:
+                if self._silent > max(TRY_NEXT_AFTER, self._slow) and self._holder is None:
                     self._try_next()
-            elif self._holder is not None and self._silent > (patience := max(LOST_AFTER, self._slow)):
-                self._lost = True
+            elif self._holder is not None and self._silent > (patience := max(UNWELL_AFTER, self._slow)):
+                self._unwell = True
                 about = f" of {self._source}" if self._source else ""
                 self._faults = {self._source or "": capture.health}
                 self._rc.unwell(f"no picture{about} for {patience:g} s: {capture.health}")
-            await asyncio.sleep(CHECK)
+            await asyncio.sleep(CHECK_PERIOD_S)
 
     def _try_next(self) -> None:
-        """With several sources, one that is dead must not keep the others from being used."""
+        """Open the next of several sources, so that a dead source does not block the others."""
         names = sorted(self._sources)
         if len(names) > 1 and self._source is not None:
             self._open(names[(names.index(self._source) + 1) % len(names)])
@@ -328,18 +326,18 @@ class FramegrabberDriver(Driver):
 
 
 def pace_of(rate: float) -> Bucket:
-    """Admits at most `rate` frames a second without holding any back: one that comes too early is skipped.
-    Its tolerance of EARLY intervals keeps a source that is a little faster, or uneven, from losing more than
-    its surplus (the generic cell rate algorithm, ITU-T I.371, annex A)."""
+    """A bucket that admits at most `rate` frames a second, to skip frames that come too early. With its tolerance of
+    EARLY intervals a slightly faster or uneven source loses only its surplus (generic cell rate algorithm, ITU-T I.371,
+    annex A)."""
     return Bucket(1 + EARLY, Fraction(rate), 0)
 
 
 class FrameMeter:
-    """What a framegrabber has published. Written by one pump at a time, read by the event loop."""
+    """Statistics of published frames. Written by one pump at a time, read by the event loop."""
 
     def __init__(self) -> None:
         self.published = self.too_large = 0
-        """Frames; too large are those of more than MAX_FRAME bytes, which are not sent."""
+        """Frames; more than MAX_FRAME bytes are too large, and not sent."""
         self.width = self.height = self.size = 0
         """Pixels and bytes of the newest frame."""
         self._times: deque[float] = deque(maxlen=1_024)
@@ -352,22 +350,20 @@ class FrameMeter:
         self._latencies.append(now - head.time)
 
     def rate(self, now: float) -> float:
-        """Frames a second in the last RATE_SPAN; 0 without any."""
+        """Frames a second in the last RATE_SPAN; 0 without frames."""
         times = [time for time in list(self._times) if now - time <= RATE_SPAN]
         return (len(times) - 1) / (times[-1] - times[0]) if len(times) > 1 and times[-1] > times[0] else 0.0
 
     def latency(self) -> float:
-        """Seconds from reading a picture to its publication: the median of the last; 0 without any."""
+        """Median of the seconds from reading a picture to its publication; 0 without frames."""
         return statistics.median(list(self._latencies) or [0.0])
 
 
 class FramePump:
-    """Publishes the pictures of a capture that are read from now on, until it is stopped; in a thread of its
-    own. `head` is what the heads of frames have in common; their numbers go on from its number. `published` is
-    called with each frame that went out, in that thread.
+    """A thread that publishes the new pictures of a capture, until it is stopped. `head`: the common part of all frame
+    heads; frame numbers count from its number. `published` is called for each published frame, in this thread.
 
-    At most `rate` frames a second, with JPEG `quality` 1..100, and only while somebody subscribes: otherwise nothing is
-    even encoded."""
+    At most `rate` frames a second, with JPEG `quality` 1..100. Without subscribers nothing is even encoded."""
 
     def __init__(
         self,
@@ -392,12 +388,12 @@ class FramePump:
         self._thread.start()
 
     def stop(self) -> None:
-        """Nothing is published any more when this returns; the thread ends a little later."""
+        """Stop publishing: when this returns, no frame follows. The thread ends a little later."""
         with self._lock:
             self._stopped = True
 
     def join(self) -> None:
-        """Waits for the end of the thread, after `stop`: some tenths of a second at most."""
+        """Wait for the end of the thread after `stop`, at most some tenths of a second."""
         self._thread.join()
 
     def _run(self) -> None:
@@ -420,7 +416,7 @@ class FramePump:
         if len(jpeg) > MAX_FRAME:
             self._meter.too_large += 1
             self._complain(
-                f"frames of {len(jpeg)} bytes are too large, at most {MAX_FRAME} are sent; lower "
+                f"frames of {len(jpeg)} bytes are too large to send (limit {MAX_FRAME}); lower "
                 "`quality`, or the resolution of the source"
             )
             return
@@ -442,15 +438,14 @@ class FramePump:
 
 
 def encode(picture: NDArray[np.uint8], quality: int) -> bytes:
-    """A picture as JPEG; one without colour as a grey JPEG, whatever its form. Raises cv2.error for one that
-    JPEG can't have."""
+    """Encode a picture as JPEG, and as grey JPEG if it has no colour. Raises cv2.error if JPEG can't hold it."""
     shown = picture[:, :, 1] if picture.ndim == 3 and is_grey(picture) else picture
     _, coded = cv2.imencode(".jpg", shown, [cv2.IMWRITE_JPEG_QUALITY, quality])
     return coded.tobytes()
 
 
 def is_grey(picture: NDArray[np.uint8]) -> bool:
-    """Whether a BGR picture has no colour. A few of its pixels settle it for most that have."""
+    """Return True if a BGR picture has no colour. Most coloured pictures are detected by a few of their pixels."""
     few = picture[::16, ::16].astype(np.int16)
     if int(np.ptp(few, axis=2).max(initial=0)) > GREY:
         return False

@@ -26,8 +26,8 @@ class InstanceState(enum.Enum):
 
 
 class Instances:
-    """Follows the instances of `rc`; `instance` is this one's id. `patience`: seconds after which no program can use
-    another instance's device, once that instance is gone."""
+    """Follows the instances of `rc`; `instance` is the id of its own. `patience`: seconds after which no program can
+    use another instance's device, once that instance is gone."""
 
     def __init__(
         self,
@@ -43,7 +43,7 @@ class Instances:
         self._supervisor, self._on_change = supervisor, on_change
         self.state = InstanceState.SERVES
         self._serves = instance
-        """The instance that serves, as far as this one knows."""
+        """The instance that serves, as far as known here."""
         self._host: HostName | None = None
         """The host of the serving instance, if known."""
         self._others: dict[str, Token] = {}
@@ -52,7 +52,7 @@ class Instances:
 
     @property
     def duplicate_of(self) -> str:
-        """The serving instance as text, such as `robot/arm1 at bellows`; "" if this one serves."""
+        """The serving instance as text, such as `robot/arm1 at bellows`; "" if `instance` serves."""
         if self.state is InstanceState.SERVES:
             return ""
         return f"{self._rc} at {self._host}" if self._host is not None else f"{self._rc} elsewhere"
