@@ -87,16 +87,15 @@ def console(*, stderr: bool = False) -> Console:
     return Console(stderr=stderr, markup=False, highlight=False, emoji=False)
 
 
-def clock(seconds: float, *, at_latest: bool = False) -> str:
-    """The time of day `seconds` from now (negative: ago) by this host's clock and zone: `14:32`, `14:32:05` within two
-    minutes of now, with the date on another day. Rounded down, with `at_latest` up."""
+def clock(seconds: float) -> str:
+    """The time of day `seconds` from now (negative: ago), as this host's clock shows it in that instant: `14:32`,
+    `14:32:05` within two minutes of now, with the date on another day.
+
+    Rounded to the nearest second, then down to the minute: an instant has one time, before and after it."""
     now = datetime.now().astimezone()
-    at = (now + timedelta(seconds=max(-MAX_CLOCK_S, min(seconds, MAX_CLOCK_S)))).astimezone()
-    near = abs(seconds) < NEAR_S
-    unit = timedelta(seconds=1) if near else timedelta(minutes=1)
-    if at_latest and (rest := (at - datetime.min.replace(tzinfo=at.tzinfo)) % unit):
-        at += unit - rest
-    time = f"{at:%H:%M:%S}" if near else f"{at:%H:%M}"
+    away = timedelta(seconds=max(-MAX_CLOCK_S, min(seconds, MAX_CLOCK_S)) + 0.5)
+    at = (now + away).replace(microsecond=0).astimezone()
+    time = f"{at:%H:%M:%S}" if abs(seconds) < NEAR_S else f"{at:%H:%M}"
     if at.date() == now.date():
         return time
     return f"{at:%Y-%m-%d} {time}" if at.year != now.year else f"{at:%b} {at.day} {time}"

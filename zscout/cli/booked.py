@@ -112,7 +112,7 @@ def _why_broken(booking: BookingView) -> str:
 
 
 def _end(booking: BookingView, date: BookedDate, told: BookingsTold) -> str:
-    return "cancelled" if booking.lasting else clock(date.end - told.time, at_latest=True)
+    return "cancelled" if booking.lasting else clock(date.end - told.time)
 
 
 def maintenance_of(told: BookingsTold, host: str) -> list[tuple[BookingView, BookedDate]]:
@@ -150,7 +150,7 @@ class NextDate(NamedTuple):
 
     def __str__(self) -> str:
         begins = f"from {clock(self.begins_in)}" if self.begins_in > 0 else "now"
-        ends = "until it is cancelled" if self.ends_in is None else f"to {clock(self.ends_in, at_latest=True)}"
+        ends = "until it is cancelled" if self.ends_in is None else f"to {clock(self.ends_in)}"
         what = "in maintenance" if self.maintenance else "booked"
         return clean(f"{self.rc} is {what} by {self.owner} ({self.booking}) {begins} {ends}")
 

@@ -83,7 +83,7 @@ class Displaced:
 
 
 def _at(seconds: float) -> str:
-    return f"at {clock(seconds, at_latest=True)} (in {span(seconds)})" if seconds > 0 else "at once"
+    return f"at {clock(seconds)} (in {span(seconds)})" if seconds > 0 else "at once"
 
 
 def covers(need: str, rc: str, host: str) -> bool:

@@ -361,7 +361,7 @@ def running(
     rows, styles = [], []
     for hold in sorted(state.holds, key=lambda hold: (-hold.priority, -hold.held)):
         since = f"{clock(-hold.held)} ({span(hold.held)})"
-        until = f"{clock(hold.remaining, at_latest=True)} ({span(hold.remaining)})"
+        until = f"{clock(hold.remaining)} ({span(hold.remaining)})"
         if hold.waits is not None:
             until = starting(hold.waits)
         elif hold.keep:

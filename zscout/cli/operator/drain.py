@@ -185,7 +185,7 @@ class _Leftovers:
         for hold in self.holds:
             # Always the same words for one end: in a pipe each change is a line.
             if hold.remaining > 0:
-                self._until.setdefault(hold.grant, f" until {clock(hold.remaining, at_latest=True)}")
+                self._until.setdefault(hold.grant, f" until {clock(hold.remaining)} at the latest")
 
     def rcs_of(self, hold: HoldView) -> list[str]:
         return sorted(self.rcs & hold.needs.keys())

@@ -134,7 +134,7 @@ def reason_text(reason: str, why: ReasonInfo | None, age: float = 0, me: User | 
                 for party in known.by
             )
         )
-    return known.text(lambda until: clock(until / SECOND - age, at_latest=True))
+    return known.text(lambda until: clock(until / SECOND - age))
 
 
 def hold_text(hold: HoldView, priority: int, me: User | None = None) -> str:
@@ -156,7 +156,7 @@ def _until(hold: Mapping[str, Any], priority: int) -> str:
         return f"{starting(waits)}, then {span(left)}" + (" at least" if stays else "")
     if left <= 0:
         return "kept for as long as it wants" if stays else "its minimum runtime is over"
-    end = f"until {clock(left, at_latest=True)} ({span(left)})"
+    end = f"until {clock(left)} ({span(left)})"
     if hold["priority"] < priority and left <= (hold["protected_from"] or 0):
         return f"protected from preemption {end}"
     return f"{end} at least, and kept for as long as it wants" if stays else f"{end} at the latest"

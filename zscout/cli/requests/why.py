@@ -193,7 +193,7 @@ def _past(ago: float) -> str:
 
 
 def _end(left: float) -> str:
-    return f"{terminal.clock(left, at_latest=True)} ({terminal.span(left)})"
+    return f"{terminal.clock(left)} ({terminal.span(left)})"
 
 
 def _print_need(need: dict[str, Any], priority: int) -> None:
