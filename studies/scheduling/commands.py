@@ -55,7 +55,7 @@ def schedule(
 
     For each: RCs in use, waiting, preemptions, work that they throw away, time per pass; and how often the
     paper's heuristic uses fewer RCs than the best set in the same situation, and what foretells it. A seed is
-    the same workload on every machine, and all but the times of passes comes out the same. docs/study.md says
+    the same workload on every machine, and all but the times of passes comes out the same. docs/evaluation says
     what was found.
 
     \b
@@ -109,7 +109,7 @@ def bookings(families: tuple[str, ...], seeds: range, processes: int | None, as_
     minutes ahead, under strategy adaptive: RCs in use, lost to bookings (idle though somebody waited whom a
     booking kept out), work thrown away by preemption; how many of the booked began at their dates, how much
     later these were than wanted, and how many of the same began at once without bookings; and the wait of those
-    who never book. docs/study.md says what was found.
+    who never book. docs/evaluation says what was found.
 
     \b
     Examples:
@@ -153,7 +153,7 @@ def forecasts(
     Each ARC is a run of one of 12 programs, and asks for so many times what it takes: always about as many for
     one program. As it is queued its start is foretold from what holds have asked for, from what was learned of
     how long they last, and from what they will take: the best there can be, as nobody knows who comes later.
-    docs/study.md says what was found.
+    docs/evaluation says what was found.
 
     \b
     Examples:
@@ -199,7 +199,7 @@ def shares(seeds: range, cases: int, processes: int | None, as_json: bool) -> No
 
     A week of 10 RCs, with fair shares and without: one group is always at work, the other comes in bursts of 20.
     Then random fleets for an hour each, in which one group asks for more time than it needs, splits what it asks
-    for, or asks for everything besides: does it get more of use? docs/study.md says what was found.
+    for, or asks for everything besides: does it get more of use? docs/evaluation says what was found.
 
     \b
     Examples:

@@ -9,7 +9,7 @@ from typing import Final, Literal, TypeAlias
 from zscout.types import SECOND, Ns
 
 PATIENCE: Final[Ns] = 142 * SECOND
-"""Least patience in ns where it follows the runtimes. Measured: docs/study.md."""
+"""Least patience in ns where it follows the runtimes. Measured: docs/evaluation/trace.md."""
 PREEMPT_BUDGET: Final = 0.25
 """Default. Measured: docs/scheduling.md."""
 FAIR_PATIENCE: Final[Ns] = 3_600 * SECOND
