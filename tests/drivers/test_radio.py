@@ -78,7 +78,7 @@ async def test_who_is_heard_by_a_radio_and_what_a_gang_must_have(tmp_path: Path)
             (
                 {"robot/r1": {}},
                 TURN,
-                "your request holds no radio, so nothing reaches the robot; request radio/rf0 as well",
+                "your request holds no radio, so it can't reach the robot; request radio/rf0 as well",
             ),
             ({"robot/r1": {}, **RADIO}, {"name": "camera", "on": True}, "request video/* as well"),
             (GANG | {"video/ch2": {}}, {"name": "camera", "on": True}, "one transmitter"),
@@ -161,6 +161,6 @@ async def test_what_a_radio_and_a_channel_carry_and_how_a_radio_is_lost(tmp_path
         # The radio's node goes: the robot can't be stopped, so it is not to be had.
         post.rcs.remove(radio)
         await radio.stop()
-        await until(lambda: arc.state == "queued" and r1.health == "radio/rf0 is not there")
+        await until(lambda: arc.state == "queued" and r1.health == "radio/rf0 is not offered")
         assert isinstance(line.packets[-1], HaltPacket | StopPacket | CameraPacket)
     line.unplug()

@@ -146,7 +146,7 @@ async def test_ports_that_can_never_be_opened_are_named_in_plain_words(tmp_path:
         for port, words in (
             (str(tmp_path / "none"), "is not there; is it plugged in?"),
             (str(file), "is no serial port"),
-            (f"socket://127.0.0.1:{bound.getsockname()[1]}", "nobody listens there"),
+            (f"socket://127.0.0.1:{bound.getsockname()[1]}", "no program listens there"),
             ("nonsense://x", "nonsense://x fails: "),
         ):
             ear = Ear()

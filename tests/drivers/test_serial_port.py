@@ -349,11 +349,11 @@ def failure(url: str, **lines: bool) -> str:
 def test_what_is_wrong_with_a_port_is_said_in_plain_words() -> None:
     with peer() as there:
         for url, words in (
-            ("socket://no-such-host.invalid:1", "names a host that is not known"),
-            ("rfc2217://no-such-host.invalid:1", "names a host that is not known"),
+            ("socket://no-such-host.invalid:1", "names an unknown host"),
+            ("rfc2217://no-such-host.invalid:1", "names an unknown host"),
             (f"rfc2217://127.0.0.1:{there.port}?timeout=0.1", "does not speak RFC 2217"),
             ("hwgrep://no such device", "is not there; is it plugged in?"),
-            ("socket://mast", "fails: it names no host and port, as socket://host:7002 does"),
+            ("socket://mast", "fails: it names no host and port; write socket://host:7002, for example"),
         ):
             assert words in failure(url)
     for error, words in (

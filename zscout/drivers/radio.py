@@ -1,8 +1,8 @@
-"""A radio: one serial line that several ARCs share, each for as many packets a second as it asked for.
+"""A radio: one serial line shared by several ARCs, each with the packet rate that it requested.
 
-Nobody acknowledges on this radio, so an answer means that a packet is in the queue, and gives the time until it will be
-out. What goes out is handed to the line no sooner than the line can carry it (`transmit_queue`): in the buffers of the
-system there is a packet or two, and a halt sent now goes out now."""
+Robots acknowledge nothing, so an answer means that a packet is in the queue, and gives the time until it is sent.
+Packets are written only as fast as the line carries them (`transmit_queue`): at most two wait in system buffers, and a
+halt is sent at once."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ from zscout.types import SECOND, Grant, Place
 RECENT: Final = 64
 """Packets over which the longest wait is measured."""
 OPENING: Final = 1.0
-"""Seconds that a node waits for the line before it offers the RC without it."""
+"""Seconds that a node waits for the line before it offers the RC as lost."""
 LONGEST_SLEEP: Final = 60.0
 
 
 class RadioDriver(Driver):
-    """The RC of a radio. It carries stops and halts for the node of any robot, the rest for its holders."""
+    """The RC of a radio. It sends stops and halts for the node of any robot, other packets for its holders only."""
 
     Options = RadioRc
     sharable = True
@@ -48,15 +48,15 @@ class RadioDriver(Driver):
         self._rate = line_rate(baud)
         self._default = default_rate(self._rate)
         self._bound = Fraction(str(bound))
-        # Not 0: the last radio of these robots may have begun there.
+        # A random first number, because an earlier radio of these robots may have ended at any number.
         stale = round(max(TIMEOUT, bound) * SECOND)
         self._air = TransmitQueue(self._rate, first_number=RANDOM.get().randrange(256), stale=stale)
         self._robots: dict[int, str] = {}
-        """Which robot RC an id belongs to: the first that commanded it, while it is there."""
+        """The robot RC by robot id: the first RC that commanded the id, while it is offered."""
         self._down = "its line is not open yet"
-        """Why nothing can be sent; empty while the line is open."""
+        """Why no packet can be sent; empty while the line is open."""
         self._known = asyncio.Event()
-        """Whether there is a line was found out."""
+        """Set once the line was opened or found missing."""
         self._quiet = asyncio.Event()
         self._outstanding = 0
         self._timer: asyncio.TimerHandle | None = None
@@ -71,14 +71,14 @@ class RadioDriver(Driver):
 
     async def open(self, rc: RcHandle) -> None:
         self._rc = own(rc)
-        # Of its own: halts still go out after the RC has closed that of its other work.
+        # A separate supervisor: halts are still sent after the RC has closed its own.
         self._supervisor = Supervisor(f"the line of {rc.name}", rc.supervisor.fail)
         self._line = SerialLine(self._port, up=self._line_up, down=self._line_down, wrote=self._line_wrote)
         if not await done_within(OPENING, self._known.wait()):
             rc.fail(self._down)
 
     async def close(self) -> None:
-        """Halts that are not out yet still go out, if the line works."""
+        """Send the waiting halts first, if the line works."""
         if not self._down and self._air.urgent:
             self._quiet.clear()
             await done_within(CLOSE_TIMEOUT, self._quiet.wait())
@@ -105,7 +105,7 @@ class RadioDriver(Driver):
         most = room(self._rate) / MAX_PACKET
         size = Decimal(MAX_PACKET)
         return [
-            # Shorter packets, and more of them, fit as well.
+            # With shorter packets a higher rate fits.
             Parameter("command_rate", "packets/s", _decimal(most), _decimal(self._default), unless=["packet_size"]),
             Parameter("packet_size", "bytes", default=size),
         ]
@@ -123,8 +123,7 @@ class RadioDriver(Driver):
             return Share(Fraction(0), Fraction(MAX_PACKET))
 
     async def end(self, holder: Holder) -> None:
-        """What waits for this holder is dropped, and the robots that it drove are halted: their own RCs do so
-        too, unless their hosts are gone."""
+        """Drop the holder's waiting packets, and halt the robots that it commanded, in case their own RCs are gone."""
         self._leave(holder.place)
 
     async def safe(self) -> None:
@@ -151,15 +150,15 @@ class RadioDriver(Driver):
         return {"after": after / SECOND}
 
     async def command_without_grant(self, sender: Sender, do: Mapping[str, Any]) -> Any:
-        """A stop or a halt for a robot, from the node of its RC: always carried."""
+        """Send a stop or a halt from the node of a robot's RC, whatever is held."""
         if do.get("name") not in ("stop", "halt"):
             return await super().command_without_grant(sender, do)
         order = radio_command(do)
         assert isinstance(order, RadioStop | RadioHalt)  # noqa: S101 - by their names
         directory = self._rc.directory
         if order.rc is None or directory is None or not directory.is_node_of(sender, order.rc):
-            raise Refused("no_grant", f"{sender} does not offer {order.rc}, the robot that it speaks for")
-        # A halt does no harm, but the robot stays with the first RC that claimed it, while that one is there.
+            raise Refused("no_grant", f"{sender} does not offer the robot {order.rc}, so it can't stop it")
+        # A halt is harmless, but the robot stays with the first RC that claimed it while that RC is offered.
         owner = self._robots.get(order.robot)
         if owner is None or not self._is_offered(owner):
             self._robots[order.robot] = order.rc
@@ -178,10 +177,10 @@ class RadioDriver(Driver):
         self._pump()
         return {"after": after / SECOND}
 
-    # Going out
+    # Sending packets
 
     def _pump(self) -> None:
-        """Hands the line what it has room for, and comes back when it has room again."""
+        """Write packets while the line has room, and set a timer for the next."""
         if self._timer is not None:
             self._timer.cancel()
         if self._down:
@@ -204,7 +203,7 @@ class RadioDriver(Driver):
             self._timer = self._supervisor.call_later(delay, self._pump)
 
     def _is_in_force(self, grant: Grant) -> bool:
-        """Whether the hold of a packet is in force at the moment when it goes out."""
+        """Return True if the hold of a packet is in force now, when the packet is sent."""
         held, holds = self._rc.holds.held.get(grant), self._rc.holds
         return held is not None and holds.check(grant, held.holder.client, self._rc.now()) is None
 

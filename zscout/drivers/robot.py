@@ -1,7 +1,7 @@
-"""A robot that is driven through a radio, and stopped whenever nobody drives it.
+"""A robot that is driven through a radio, and stopped when drive commands cease.
 
-The robot receives packets and sends none. So it counts as there once its radio has taken a halt for it, and as lost
-while its radio can't."""
+The robot only receives packets. So it counts as working once its radio has accepted a halt for it, and as unwell while
+the radio can't send one."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ from zscout.messages import Command, Done, Figures, Holder, Parameter, RcState
 from zscout.types import SECOND, Grant, Ns
 
 ANSWER: Final = 0.5
-"""Seconds within which the radio answers a command, and for which one may wait on its way."""
+"""Seconds for the radio's answer to a command, and longest time that a command may wait on its way."""
 HALT_ANSWER: Final = 0.25
 HALT_TRIES: Final = 4
-"""Before the robot counts as lost; it is tried on all the same."""
+"""Failed halts after which the robot is unwell. Further halts follow."""
 PAUSES: Final = (0.05, 2.0)
 """Seconds between halts while its state is unknown: the first, and the longest."""
-LOOK_AGAIN: Final = 0.5
-"""Seconds between two looks whether it still stands by."""
+STANDBY_CHECK_S: Final = 0.5
+"""Between two checks whether it is still on standby."""
 MAX_WAITING: Final = 16
 RECENT: Final = 64
 """Answers of the radio over which the latency is measured."""
@@ -41,7 +41,7 @@ RECENT: Final = 64
 
 @dataclass(slots=True)
 class _Waiting:
-    """A command that was not passed to the radio yet."""
+    """A command that was not yet sent to the radio."""
 
     order: commands.RadioDrive | commands.RadioCamera | commands.RadioStop
     radio: str
@@ -49,7 +49,7 @@ class _Waiting:
     answer: asyncio.Future[Any]
 
     def resolve(self, outcome: Any) -> None:
-        """Answers the command, once; a Refused refuses it."""
+        """Answer the command if it has no answer yet. A Refused as outcome refuses it."""
         if self.answer.done():
             return
         if isinstance(outcome, Refused):
@@ -59,21 +59,21 @@ class _Waiting:
 
 
 class RobotDriver(Driver):
-    """The RC of a robot, whose halt is carried by the RC `radio`."""
+    """The RC of a robot. The RC `radio` sends its halts."""
 
     Options = RobotRc
 
     def __init__(self, robot: int, *, radio: str, channels: Mapping[str, int], warm_up: float, dead_man: float) -> None:
-        """`robot`: its id on the air. `channels`: of its camera, by video RC. `warm_up`: seconds until the
-        camera works. `dead_man`: seconds after which it is stopped where no drive command follows, however
-        long the last one may last."""
+        """`robot`: its id on the air. `channels`: of its camera, by video RC. `warm_up`: seconds until the camera
+        works. `dead_man`: seconds after the last drive command until the robot is stopped, even if this command lasts
+        longer."""
         self.activation = warm_up
         self._id, self._radio, self._channels = robot, radio, dict(channels)
         self._dead_man = dead_man
         self._waiting: deque[_Waiting] = deque()
         self._timer: asyncio.TimerHandle | None = None
         self._stopped_at: Ns | None = 0
-        """When the wheels stop by themselves; None: unknown, a drive command is under way."""
+        """When the wheels stop by themselves; None while a drive command is under way."""
         self._unsure = asyncio.Event()
         self._unsure.set()
         self._wake = asyncio.Event()
@@ -111,7 +111,7 @@ class RobotDriver(Driver):
         return []
 
     def usable_cold(self, do: Mapping[str, Any]) -> bool:
-        """Only the camera warms up, and not before a command switches it on."""
+        """Only the camera warms up, and only after a command that switches it on."""
         return True
 
     # Commands
@@ -124,7 +124,7 @@ class RobotDriver(Driver):
         if isinstance(order, commands.RobotCamera):
             sent = commands.RadioCamera(self._id, self._channel_of(holder) if order.on else 0)
         else:
-            self._drop({"replaced": True}, commands.RadioDrive)  # the newest is the true one
+            self._drop({"replaced": True}, commands.RadioDrive)  # the newest command wins
             sent = commands.RadioStop(self._id)
             if isinstance(order, commands.RobotDrive):
                 sent = commands.RadioDrive(self._id, order.left, order.right, order.lasts)
@@ -137,17 +137,17 @@ class RobotDriver(Driver):
         return waiting.answer
 
     def _radio_of(self, holder: Holder) -> str:
-        """The radio of the robot's gang: its own, or the only one."""
+        """The radio in the robot's gang: its own, or the only other radio."""
         radios = [rc for rc in holder.rcs if rc.startswith("radio/")]
         if self._radio in radios:
             return self._radio
         if len(radios) == 1:
             return radios[0]
         holds = "holds no radio" if not radios else f"holds {' and '.join(radios)}, and not its own"
-        raise Refused("no_radio", f"your request {holds}, so nothing reaches the robot; request {self._radio} as well")
+        raise Refused("no_radio", f"your request {holds}, so it can't reach the robot; request {self._radio} as well")
 
     def _channel_of(self, holder: Holder) -> int:
-        """The channel of the video RC in the robot's gang."""
+        """The camera channel of the video RC in the robot's gang."""
         videos = [rc for rc in holder.rcs if rc.startswith("video/")]
         if not videos:
             raise Refused("no_video", "your request holds no video channel to transmit on; request video/* as well")
@@ -161,7 +161,7 @@ class RobotDriver(Driver):
         return channel
 
     async def _send_all(self) -> None:
-        """Has the radio send what waits, one after the other."""
+        """Send the waiting commands to the radio, in order."""
         while True:
             await self._queued.wait()
             self._queued.clear()
@@ -181,7 +181,7 @@ class RobotDriver(Driver):
             waiting.resolve(result)
             return
         self._counts["refused"] += 1
-        code, why = "unknown", f"{waiting.radio} did not answer: it may have been sent or not"
+        code, why = "unknown", f"{waiting.radio} did not answer: the command may have been sent or not"
         if reply is not None and reply.problem is not None:
             code, why = "radio_refused", f"{waiting.radio}: {reply.problem.message} ({reply.problem.code})"
         waiting.resolve(Refused(code, why))
@@ -193,7 +193,7 @@ class RobotDriver(Driver):
         return await self._mesh.ask_one(key, message, Done, timeout=timeout)
 
     def _drop(self, outcome: Any, kind: type = object) -> None:
-        """Answers by `outcome` the commands of this kind that wait; they are not sent."""
+        """Remove the waiting commands of this kind, and answer them with `outcome`."""
         for waiting in [waiting for waiting in self._waiting if isinstance(waiting.order, kind)]:
             self._waiting.remove(waiting)
             waiting.resolve(outcome)
@@ -201,14 +201,13 @@ class RobotDriver(Driver):
     # Stopping
 
     async def safe(self) -> None:
-        """The robot halts: wheels and transmitter. Where the radio does not take that, the RC counts as lost
-        until it does."""
+        """Halt the robot: wheels and transmitter. The RC is unwell until the radio accepts the halt."""
         self._restart_dead_man(turns=False)
-        self._drop(Refused("ended", "the hold ended before it was sent"))
+        self._drop(Refused("ended", "the hold ended before the command was sent"))
         await self._send_urgent(commands.RadioHalt(self._id, self._rc.name), HALT_TRIES)
 
     def _restart_dead_man(self, *, turns: bool) -> None:
-        """A command for the wheels arrived: the dead man's clock begins anew, or is stopped."""
+        """Restart the dead man's clock if the wheels turn, otherwise stop it."""
         if self._timer is not None:
             self._timer.cancel()
         self._stopped_at = None if turns else 0
@@ -219,16 +218,16 @@ class RobotDriver(Driver):
         if self._stopped_at is not None and self._stopped_at <= self._mesh.now():
             return
         self._counts["dead_man_stops"] += 1
-        self._drop(Refused("stale", "it waited too long for the radio"), commands.RadioDrive)
+        self._drop(Refused("stale", "the command waited too long for the radio"), commands.RadioDrive)
         self._stopped_at = 0
         self._rc.supervisor.spawn(self._send_urgent(commands.RadioStop(self._id, self._rc.name), HALT_TRIES))
 
     async def _send_urgent(self, order: commands.RadioStop | commands.RadioHalt, tries: int) -> bool:
-        """Has the robot's own radio send a stop or a halt. False: it could not, and the RC counts as lost."""
+        """Send a stop or a halt by the robot's own radio. Return False if that failed; the RC is then unwell."""
         problem = ""
         for _ in range(tries):
             if not self._directory.hosts(self._radio):
-                problem = f"{self._radio} is not there"
+                problem = f"{self._radio} is not offered"
                 break
             reply = await self._ask_radio(self._radio, order, None, HALT_ANSWER)
             if reply is not None and reply.message is not None:
@@ -241,21 +240,21 @@ class RobotDriver(Driver):
         return False
 
     def _set_unsure(self, why: str) -> None:
-        """The robot can't be stopped for now, so that it must not be driven either."""
+        """The robot can't be stopped, so it must not be driven either."""
         if self._rc.health != why:
             self._rc.unwell(why)
         self._unsure.set()
 
     async def _halt_until_sure(self) -> None:
-        """Halts the robot whenever its state is unknown, and offers it again once that is done."""
+        """Halt the robot whenever its state is unknown, and recover when that succeeds."""
         pause = PAUSES[0]
         await self._rc.informed.wait()
         while True:
             await self._unsure.wait()
             self._wake.clear()
             if self._rc.instances.state is InstanceState.STANDS_BY:
-                # Another host's is used, and its holder has the robot.
-                await asyncio.sleep(LOOK_AGAIN)
+                # Another host's instance serves, and its holder has the robot.
+                await asyncio.sleep(STANDBY_CHECK_S)
                 continue
             if await self._send_urgent(commands.RadioHalt(self._id, self._rc.name), 1):
                 self._unsure.clear()
@@ -268,7 +267,7 @@ class RobotDriver(Driver):
     def _on_directory_change(self) -> None:
         self._wake.set()
         if not self._directory.hosts(self._radio) and not self._unsure.is_set():
-            self._set_unsure(f"{self._radio} is not there")
+            self._set_unsure(f"{self._radio} is not offered")
 
     def _on_radio_state(self, _key: str, state: RcState) -> None:
         if state.rc != self._radio:
@@ -285,6 +284,6 @@ class RobotDriver(Driver):
 
 
 def _after(result: Any) -> float:
-    """Seconds until a packet is out, as the radio answered."""
+    """Seconds until a packet is sent, from the radio's answer."""
     after = result.get("after") if isinstance(result, dict) else None
     return float(after) if isinstance(after, int | float) and 0 <= after < 60 else 0.0

@@ -1,8 +1,8 @@
-"""One port of pyserial, by any of its names: a device, a link to one, or a URL. Blocking.
+"""A port of pyserial, by any name: a device, a link to a device, or a URL. Blocking.
 
-Bytes that the other end does not take within TIMEOUT are discarded, never sent later: the system's own count of bytes
-that no device or peer has taken is looked at, TCP gives up after as long, and a connection that failed is reset. A pty
-has no such count: up to 4,095 bytes wait at its other end unseen."""
+Bytes that the other end does not take within TIMEOUT are discarded, never sent later. For this, the port checks the
+system's count of bytes not yet taken by the device or peer, TCP gives up after TIMEOUT, and a failed connection is
+reset. A pty has no such count: up to 4,095 bytes can wait unseen at its other end."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ from zscout.mesh import clock
 from zscout.types import SECOND, Ns
 
 TIMEOUT: Final = 1.0
-"""Seconds that reading and writing may take, and after which no byte that was written may still be on its way."""
+"""Seconds for reading or writing. After this time no written byte may still be on its way."""
 IDLE: Final = 0.2
-"""Seconds from one look at an open port to the next: is it there still, and what has it taken?"""
+"""Seconds between two checks of an open port: that it exists, and how many bytes it has taken."""
 CONNECT: Final = 2.0
 READ_AT_ONCE: Final = 4_096
 SEND_BUFFER: Final = 16_384
 IDLE_TIMEOUT: Final = 4.0
-"""Seconds after which a peer that answers no probe counts as gone, where nothing was written to it."""
+"""Seconds after which a peer that answers no probes counts as gone, when nothing was written to it."""
 OPTIONS: Final = (
     ("SOL_SOCKET", "SO_SNDBUF", SEND_BUFFER),
     ("SOL_SOCKET", "SO_KEEPALIVE", 1),
@@ -46,19 +46,19 @@ OPTIONS: Final = (
     ("IPPROTO_TCP", "TCP_KEEPCNT", 4),
 )
 PTS: Final = range(136, 144)
-"""Device numbers of pseudo-terminals, which each container counts for itself."""
+"""Major device numbers of pseudo-terminals. Each container has its own minor numbers."""
 
 _NOT_THERE: Final = "is not there; is it plugged in?"
 _MOVED: Final = "leads to another device now"
-_SILENT: Final = f"took nothing for {TIMEOUT:g} s; is what hangs on it stalled?"
+_SILENT: Final = f"took nothing for {TIMEOUT:g} s; has the connected device stalled?"
 _WORDS: Final = {
     **dict.fromkeys((errno.ENOENT, errno.ENODEV, errno.ENXIO), _NOT_THERE),
     **dict.fromkeys(
-        (errno.EACCES, errno.EPERM), "may not be opened by this user; add it to the group of the port, often dialout"
+        (errno.EACCES, errno.EPERM), "can't be opened by this user; add the user to the port's group, often dialout"
     ),
     **dict.fromkeys((errno.EBUSY, errno.EAGAIN), "is used by another program"),
     errno.ENOTTY: "is no serial port",
-    errno.ECONNREFUSED: "does not answer: nobody listens there",
+    errno.ECONNREFUSED: "refuses connections: no program listens there",
     **dict.fromkeys((errno.EHOSTUNREACH, errno.ENETUNREACH, errno.ENETDOWN), "can't be reached; is its host up?"),
     **dict.fromkeys((errno.ECONNRESET, errno.EPIPE, errno.ECONNABORTED), "was cut off by the other end"),
     errno.ETIMEDOUT: _SILENT,
@@ -72,18 +72,17 @@ _TEXTS: Final = (
     ("write failed|device reports readiness", _WORDS[errno.EIO]),
     ("socket disconnected|connection failed", _WORDS[errno.EPIPE]),
     ("no ports found", _NOT_THERE),
-    (r"\[Errno -\d+\]", "names a host that is not known"),
+    (r"\[Errno -\d+\]", "names an unknown host"),
     ("not seem to support RFC2217", "does not speak RFC 2217; is it a plain socket://?"),
     ("not accept parameter change", "does not take this baud rate"),
 )
 _NUMBER: Final = re.compile(r"(?:\[Errno |\()(\d+)[],]")
-"""Where pyserial hides an error number in its words."""
+"""The error number in a message of pyserial."""
 
 
 class SerialPort:
-    """`url` is anything that pyserial's `serial_for_url` takes; `dtr`, `rts`: how these lines are from its opening on,
-    None: as pyserial has them. It may be opened again after `close`. Methods raise any exception that pyserial lets
-    through: see `plain`."""
+    """`url`: as for pyserial's `serial_for_url`. `dtr`, `rts`: states of these lines after opening; None: pyserial's
+    default. It can be reopened after `close`. Methods raise any exception that pyserial does not catch: see `plain`."""
 
     def __init__(self, url: str, baud: int, *, dtr: bool | None = None, rts: bool | None = None) -> None:
         self.url = url
@@ -93,8 +92,8 @@ class SerialPort:
         self._recent: deque[tuple[Ns, int]] = deque()
         """The writes within TIMEOUT: instant and size."""
         self._source: Any = None
-        """The local address and TCP port of a connection that failed. A peer that has not noticed lets go of it, and
-        takes a new one, when that comes from the same port."""
+        """The local address and TCP port of the last failed connection. A peer that has not noticed the failure accepts
+        a new connection if it comes from the same port."""
 
     def open(self) -> None:
         import serial
@@ -102,7 +101,7 @@ class SerialPort:
         from serial.urlhandler import protocol_socket
 
         port: Any = serial.serial_for_url(self.url, self._baud, timeout=TIMEOUT, do_not_open=True)
-        if not isinstance(port, rfc2217.Serial):  # which knows none
+        if not isinstance(port, rfc2217.Serial):  # which has no write timeout
             port.write_timeout = TIMEOUT
         if self._dtr is not None:
             port.dtr = self._dtr
@@ -111,13 +110,13 @@ class SerialPort:
         is_device = isinstance(port, serial.Serial)
         is_network = isinstance(port, rfc2217.Serial | protocol_socket.Serial)
         if is_device:
-            # Of two programs on one line neither would be understood.
+            # Two programs on one line would garble each other's bytes.
             port.exclusive = True
         names = _device_names(port.port) if is_device else _network_names(self.url) if is_network else ()
         self._locked.enter_context(port_lock(names))
         try:
             if is_network:
-                # pyserial's own `open`, with connections that are bounded.
+                # pyserial's own `open`, but with bounded connection times.
                 sockets = SimpleNamespace(**(vars(socket) | {"create_connection": self._connect}))
                 module = vars(sys.modules[type(port).__module__])
                 FunctionType(type(port).open.__code__, {**module, "socket": sockets})(port)
@@ -137,7 +136,7 @@ class SerialPort:
         self._port.write(data)
 
     def look(self) -> int:
-        """Call it each IDLE. Raises if the port is not usable any more; returns how many bytes came in."""
+        """Call this every IDLE seconds. Return the number of received bytes. Raises if the port has become unusable."""
         left = self.outstanding()
         if not left:
             self._bound(IDLE_TIMEOUT)
@@ -157,14 +156,14 @@ class SerialPort:
         return came
 
     def outstanding(self) -> int:
-        """Bytes that were written and not yet taken by the device or the peer; 0 where the system does not know."""
+        """Written bytes that the device or the peer has not taken yet; 0 if the system does not count them."""
         with suppress(Exception):
             at = self._socket or self._port
             return int(struct.unpack("i", fcntl.ioctl(at.fileno(), termios.TIOCOUTQ, bytes(4)))[0])
         return 0
 
     def close(self, *, discard: bool) -> None:
-        """`discard` the bytes that were not taken: they would arrive late."""
+        """`discard`: drop the bytes that were not taken, because they would arrive late."""
         connection = self._socket
         with suppress(Exception):
             if connection is None:
@@ -185,12 +184,13 @@ class SerialPort:
         return getattr(self._port, "_socket", None)
 
     def _bound(self, seconds: float) -> None:
-        """For how long TCP waits for its peer. With nothing under way it is longer: a probe is sent but once."""
+        """Set how long TCP waits for its peer. While no bytes are under way it must be longer, as a lost probe is not
+        repeated."""
         if self._socket is not None and hasattr(socket, "TCP_USER_TIMEOUT"):
             self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, round(1000 * seconds))
 
     def _connect(self, address: tuple[str, int], timeout: float | None = None) -> socket.socket:
-        """In the place of `socket.create_connection`."""
+        """Replaces `socket.create_connection`."""
         failed = OSError(errno.EADDRNOTAVAIL, "no address")
         for family, kind, number, _, to in socket.getaddrinfo(*address, type=socket.SOCK_STREAM):
             connection = socket.socket(family, kind, number)
@@ -200,7 +200,7 @@ class SerialPort:
                         connection.setsockopt(getattr(socket, level), getattr(socket, option), value)
                 if self._source is not None:
                     connection.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-                    with suppress(OSError):  # in use, or its interface is gone: from any port, then
+                    with suppress(OSError):  # in use, or its interface is gone: then use any port
                         connection.bind(self._source)
                 connection.settimeout(CONNECT)
                 connection.connect(to)
@@ -216,7 +216,7 @@ class SerialPort:
 
 
 def _device_names(path: str) -> Iterator[str]:
-    """A device whatever its name: a link, a relative path, a node of its own in a container."""
+    """Yield a name of the device itself, whatever its path: a link, a relative path, a device node of a container."""
     found = Path(path).stat()
     if stat.S_ISCHR(found.st_mode):
         major = os.major(found.st_rdev)
@@ -224,10 +224,10 @@ def _device_names(path: str) -> Iterator[str]:
 
 
 def _network_names(url: str) -> Iterator[str]:
-    """A port of a host, by all addresses of the host; this host has one name for all of its own."""
+    """Yield names of a TCP port, one for each address of its host. All addresses of this host have the same name."""
     parts = urlsplit(url)
     if not parts.hostname or parts.port is None:
-        raise ValueError(f"it names no host and port, as {parts.scheme}://host:7002 does")
+        raise ValueError(f"it names no host and port; write {parts.scheme}://host:7002, for example")
     for family, kind, _, _, to in socket.getaddrinfo(parts.hostname, parts.port, type=socket.SOCK_DGRAM):
         address = ip_address(str(to[0]).partition("%")[0])
         if isinstance(address, IPv6Address) and address.ipv4_mapped:
@@ -241,7 +241,7 @@ def _network_names(url: str) -> Iterator[str]:
 
 
 def _keep_lines(fd: int) -> None:
-    """The lines stay as they are when the port is closed: a board is not reset when it is opened again."""
+    """Keep the lines' states when the port is closed, so that reopening does not reset a board."""
     with suppress(termios.error):
         mode = termios.tcgetattr(fd)
         mode[2] &= ~termios.HUPCL
@@ -249,7 +249,7 @@ def _keep_lines(fd: int) -> None:
 
 
 def plain(error: Exception) -> str:
-    """The fault of a port, in words that follow its name, for people who do not know pyserial."""
+    """The fault of a port as text that follows its name, for people who do not know pyserial."""
     if isinstance(error, InUse):
         return str(error)
     text = str(error)
