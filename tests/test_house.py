@@ -32,7 +32,8 @@ HEADLESS = (
 """A clause without its noun: who holds it, what was asked."""
 PLAIN = [
     "zscout/drivers",
-    *("zscout/components", "zscout/config", "zscout/mesh", "zscout/placement", "zscout/simulation", "zscout/testing"),
+    *("zscout/components", "zscout/config", "zscout/placement", "zscout/simulation", "zscout/testing"),
+    *("zscout/mesh", "zscout/messages"),
     *("zscout/keyexpr.py", "zscout/logs.py", "zscout/ports.py", "zscout/streams.py", "zscout/terminal.py"),
     *("zscout/trace.py", "zscout/types.py"),
 ]

@@ -18,7 +18,17 @@ from zscout.behaviors.client.bookings import BookingsClient, RcmSilent
 from zscout.behaviors.client.client import Client, CommandRefused, RequestRefused
 from zscout.behaviors.client.request import amounts
 from zscout.keyexpr import RANDOM, new_instance
-from zscout.messages import Amounts, Book, BookingRecord, BookingView, FindSlots, SlotsTold, Unbook, decode_told, encode
+from zscout.messages import (
+    Amounts,
+    Book,
+    BookingRecord,
+    BookingView,
+    FindSlots,
+    SlotsTold,
+    Unbook,
+    decode_received,
+    encode,
+)
 from zscout.services.bookings.dates import DAY
 from zscout.testing.virtual_time import START
 
@@ -42,7 +52,7 @@ NOT_TAKEN: Final = frozenset({"unknown_booking"})
 
 @lru_cache(1 << 12)
 def _record(raw: bytes) -> BookingRecord:
-    return decode_told(raw, BookingRecord)
+    return decode_received(raw, BookingRecord)
 
 
 class MemoryDisk:

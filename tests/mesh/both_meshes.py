@@ -44,7 +44,7 @@ class Strict(Message, frozen=True):
     number: int = 0
 
 
-messages.NAMES_ONCE.add(Strict)
+messages.UNIQUE_NAMES.add(Strict)
 
 
 class World:

@@ -173,7 +173,7 @@ def explain(error: BaseException) -> tuple[int, str] | None:
     from zscout.config.strict import BadInput
     from zscout.keyexpr import BadName
     from zscout.mesh import MeshError
-    from zscout.messages import DOOR_CODES
+    from zscout.messages import ADMISSION_CODES
     from zscout.simulation import DemoFailed
 
     words = f"zscout: {_line(str(error))}"
@@ -186,7 +186,7 @@ def explain(error: BaseException) -> tuple[int, str] | None:
             return BAD_INPUT, words
         case PlacerSilent() | RcmSilent():
             return NOBODY, words
-        case RequestRefused(code=code) if code in DOOR_CODES:
+        case RequestRefused(code=code) if code in ADMISSION_CODES:
             return BAD_INPUT, words.replace(HINT[1], HINT[0])
         case RequestRefused() | CommandRefused() | MeshError() | DemoFailed():
             return COULD_NOT, words

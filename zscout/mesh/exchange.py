@@ -257,7 +257,7 @@ class PolledSubscription(Declaration, Generic[S]):
                 return
             key, payload = sample
             try:
-                message: S = messages.decode_told(payload, self._kind)
+                message: S = messages.decode_received(payload, self._kind)
             except Malformed:
                 continue
             yield key, message

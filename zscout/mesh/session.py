@@ -319,7 +319,7 @@ class Mesh:
         now = self.now()
         try:
             if ok:
-                return Reply(key, messages.decode_told(payload, kind, limit), arrived=now)
+                return Reply(key, messages.decode_received(payload, kind, limit), arrived=now)
             if payload == b"Timeout":
                 return None
             return Reply("", None, messages.decode(payload, Problem), now)
@@ -490,7 +490,7 @@ class Mesh:
             if not handlers:
                 return
             try:
-                message: S = messages.decode_told(payload, kind, limit)
+                message: S = messages.decode_received(payload, kind, limit)
             except Malformed as error:
                 self._malformed_log.warning(name, "ignored a publication on %.200r: %s", name, error)
                 return

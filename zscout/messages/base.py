@@ -1,6 +1,6 @@
-"""What all messages have in common: their base, bounds, and the way to JSON and back.
+"""The base class of messages, their bounds, and their encoding as JSON.
 
-Numbers from outside are bounded and made exact here before anything is computed with them."""
+Numbers received from other processes are checked and made exact here before any computation."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ from zscout.types import NO_TERM, SECOND, Ns, Params, Term
 MAX_PAYLOAD = 65_536
 """Bytes of one query."""
 MAX_STATE = 16_000_000
-"""Bytes of one answer or publication, which may be about a whole fleet."""
+"""Bytes of one answer or publication, which may cover a whole fleet."""
 MAX_LISTED = 400_000
-"""Bytes of a client's answer on what it asks for: decoding it takes below 20 ms."""
+"""Bytes of a client's list of requests: decoding it takes less than 20 ms."""
 MAX_HELD = 1_000_000
 """Bytes of an RC's state, with all its holders."""
 MAX_NEEDS = 64
@@ -31,13 +31,13 @@ MAX_PARAMS = 16
 MAX_COUNTER = 2**52 - 1
 """A term whose counter is above this is rejected."""
 MAX_INCARNATION = MAX_COUNTER * 1000
-"""Of a component: the placer of a term counts from a thousand times its counter on."""
+"""Of a component: a placer starts counting at a thousand times the counter of its term."""
 MAX_JUMP = 1_000_000
-"""A term whose counter is this far above all that were received is an error, not an election."""
+"""A counter this far above all received terms is an error, not the result of elections."""
 LAST_TERMS = MAX_COUNTER - 2**20
-"""Above this counter terms come one by one: nobody can use up at once those that are left."""
+"""Above this counter only the next term is accepted, so that a single message can't use up the remaining terms."""
 MAX_ERROR = 400
-"""Characters in the text of an error: it may quote what was sent."""
+"""Characters in the text of an error, which may quote the rejected input."""
 MAX_DIGITS = 25
 MAX_EXPONENT = 18
 MAX_SECONDS = Decimal(10 * 366 * 86_400)
@@ -49,17 +49,17 @@ Finite: TypeAlias = Annotated[float, msgspec.Meta(ge=-1e9, le=1e9)]
 Metres: TypeAlias = Finite
 Radians: TypeAlias = Finite
 Seconds: TypeAlias = Finite
-"""A duration that is computed with: bounded, so that it is still finite in nanoseconds."""
+"""A duration in seconds, bounded so that it is finite in nanoseconds."""
 Elapsed: TypeAlias = Annotated[float, msgspec.Meta(ge=0, le=1e9)]
-"""Likewise, of the past."""
+"""A duration in seconds that is not negative."""
 WallTime: TypeAlias = Annotated[float, msgspec.Meta(ge=0, le=1e11)]
 """Seconds since 1970, UTC."""
 ShortText: TypeAlias = Annotated[str, msgspec.Meta(min_length=1, max_length=130)]
 """A name, or `kind/name`."""
 VersionText: TypeAlias = Annotated[str, msgspec.Meta(max_length=64)]
-"""What `zscout --version` prints where it is from; empty: it is older than versions that tell theirs."""
-FIRST_TOLD = "0.2.0"
-"""The first version that tells itself."""
+"""The output of `zscout --version` at the sender; empty if the sender is older than FIRST_WITH_VERSION."""
+FIRST_WITH_VERSION = "0.2.0"
+"""The first version of zscout that sends its version."""
 RcSeconds: TypeAlias = Annotated[float, msgspec.Meta(ge=0, le=1e15)]
 Figure: TypeAlias = Annotated[float, msgspec.Meta(ge=0, le=1e9)]
 Bytes: TypeAlias = Annotated[int, msgspec.Meta(ge=0, le=1 << 60)]
@@ -70,15 +70,15 @@ class Message(msgspec.Struct, frozen=True, omit_defaults=True):
 
 
 class Problem(Message, frozen=True):
-    """Why something was refused. `term` is the term that the replier has promised, where that is why; `left` the
-    seconds for which an RC that answers `settling` may go on to do so."""
+    """A refusal. `term`, for a refusal because of a lower term: the term that the replier has promised. `left`, with
+    `settling`: seconds for which the RC may continue to answer so."""
 
     code: str
     message: str
     term: Term | None = None
     left: Seconds | None = None
     version: VersionText = ""
-    """Of who did not understand what was asked."""
+    """Version of the replier, in refusals that a version difference may explain."""
 
 
 class Refused(Exception):
@@ -99,43 +99,45 @@ T = TypeVar("T")
 M = TypeVar("M", bound=Message)
 _ENCODER = msgspec.json.Encoder(decimal_format="number")
 _decoder: Callable[[Any], msgspec.json.Decoder[Any]] = cache(msgspec.json.Decoder)
-NAMES_ONCE: set[Any] = set()
-"""Kinds in which a name that stands twice in one object is refused. The decoder alone takes the last, which
-in a request would silently drop a need; elsewhere the 6 us are not worth it."""
+UNIQUE_NAMES: set[Any] = set()
+"""Kinds in which a duplicate name in an object is rejected. The decoder alone takes the last value, which in a request
+would silently drop a need; elsewhere the check is not worth its 6 us."""
 
 LIMITS: dict[Any, int] = {}
-"""Bytes of one message of that kind, where they are fewer than of others."""
+"""Bytes of one message of a kind with a lower limit than others."""
 
 
 NEWEST_COUNTS: set[Any] = set()
-"""Kinds of publications of which the newest on a key tells all: of many that wait some are left out."""
+"""Kinds of publications that are complete in themselves: while many on a key wait, only the newest count."""
 
 
 class Malformed(ValueError):
-    """A payload that is not the message it should be; the text names what and where."""
+    """A payload that is no valid message of its kind; the text names the fault and its position."""
 
 
 def absurd(term: Term, known: Term, *, heard: bool = True) -> bool:
-    """Whether `term` is too far above `known`, the newest received, to be accepted. Where no RCM that is believed is
-    `heard`, as before the first one (`NO_TERM`), any up to LAST_TERMS is accepted: a fleet may be old. Of those above
-    it only the next is, and who does not know it asks others (`zscout.mesh.terms`)."""
+    """Return True if `term` is too far above `known`, the newest received, to be accepted.
+
+    Without a credible RCM (not `heard`, or `known` is NO_TERM) any term up to LAST_TERMS is accepted: a fleet may be
+    old. Above LAST_TERMS only the next term is accepted, and a process that does not know the present term queries
+    others (`zscout.mesh.terms`)."""
     bound = known.counter + MAX_JUMP if heard and known != NO_TERM else MAX_COUNTER
     return term.counter > min(bound, max(LAST_TERMS, known.counter + 1), MAX_COUNTER)
 
 
 def of_the_last(term: Term, known: Term) -> bool:
-    """Whether `term` is absurd only because `known` is too old to judge it."""
+    """Return True if `term` is absurd only because it is one of the last terms and `known` may be outdated."""
     return max(LAST_TERMS, known.counter + 1) < term.counter <= MAX_COUNTER
 
 
 def disbelieved(term: Term, known: Term) -> bool:
-    """Whether who refused `term` for a lower one, `known`, hears an RCM that it obeys, and goes on to do so."""
+    """Return True if a process that refused `term` obeys an RCM of the lower term `known`, and will continue to."""
     return absurd(term, known) and not of_the_last(term, known)
 
 
 def version_words(version: str) -> str:
-    """What others told as their `version`, for people."""
-    return f"version {version}" if version else f"older than {FIRST_TOLD}"
+    """The `version` field of another process, for people."""
+    return f"version {version}" if version else f"older than {FIRST_WITH_VERSION}"
 
 
 def encode(message: msgspec.Struct) -> bytes:
@@ -143,14 +145,14 @@ def encode(message: msgspec.Struct) -> bytes:
 
 
 def decode(payload: bytes, kind: type[T] | Any, limit: int = MAX_PAYLOAD) -> T:
-    """`payload` as a message of `kind` (a struct, or a union of tagged ones). Raises Malformed."""
+    """Decode `payload` as a message of `kind` (a struct, or a union of tagged structs). Raises Malformed."""
     if len(payload) > limit:
-        raise Malformed(f"{len(payload)} bytes are too many; at most {limit} are taken")
+        raise Malformed(f"{len(payload)} bytes are too many; at most {limit} are accepted")
     try:
         message: T = _decoder(kind).decode(payload)
-        # What is as this encodes it has no name twice.
-        if kind in NAMES_ONCE and _ENCODER.encode(message) != payload:
-            _ONCE.decode(payload.decode())
+        # A payload equal to its own encoding has no duplicate names.
+        if kind in UNIQUE_NAMES and _ENCODER.encode(message) != payload:
+            _UNIQUE.decode(payload.decode())
     except (msgspec.MsgspecError, ValueError, RecursionError) as error:
         name = getattr(kind, "__name__", "operation")
         raise Malformed(f"not a valid {name}: {str(error)[:MAX_ERROR]}") from None
@@ -158,29 +160,30 @@ def decode(payload: bytes, kind: type[T] | Any, limit: int = MAX_PAYLOAD) -> T:
 
 
 def largest(kind: Any, limit: int = MAX_STATE) -> int:
-    """Bytes of one message of that kind at most."""
+    """The most bytes of one message of a kind."""
     return min(limit, LIMITS.get(kind, limit))
 
 
-def decode_told(payload: bytes, kind: type[T] | Any, limit: int = MAX_STATE) -> T:
-    """The same of what is published or answered, and may be passed on: it holds no decimal that is no number, or of
-    implausible size, which others could not read again. (An operation is refused for one in words of its own.)"""
+def decode_received(payload: bytes, kind: type[T] | Any, limit: int = MAX_STATE) -> T:
+    """Decode a publication or an answer, which may be passed on: reject decimals that are not finite or of implausible
+    size, which others could not read again. (Operations are decoded by `decode`, and checked with errors of their own.)
+    """
     message: T = decode(payload, kind, largest(kind, limit))
     check: Callable[[Any], bool] = _plausible(kind)
     if not check(message):
-        raise Malformed(f"not a valid {kind.__name__}: a decimal in it is no number, or beyond 1e{MAX_EXPONENT}")
+        raise Malformed(f"not a valid {kind.__name__}: a decimal in it is not a number, or beyond 1e{MAX_EXPONENT}")
     return message
 
 
 def _check_of(kind: inspect.Type) -> Callable[[Any], bool] | None:
-    """None: there are no decimals in it."""
+    """A check of the decimals in values of `kind`; None if there are none."""
     match kind:
         case inspect.DecimalType():
             return lambda value: value.is_finite() and (not value or abs(value.adjusted()) <= MAX_EXPONENT)
         case inspect.Metadata(type=of):
             return _check_of(of)
         case inspect.StructType(fields=fields):
-            checks = [(attrgetter(one.name), check) for one in fields if (check := _check_of(one.type)) is not None]
+            checks = [(attrgetter(own.name), check) for own in fields if (check := _check_of(own.type)) is not None]
             if len(checks) == 1:
                 ((get, only),) = checks
                 return lambda value: only(get(value))
@@ -189,7 +192,7 @@ def _check_of(kind: inspect.Type) -> Callable[[Any], bool] | None:
             return _check_of_each(of, iter)
         case inspect.DictType(value_type=of):
             return _check_of_each(of, dict.values)
-        case inspect.UnionType(types=types):  # of messages that are told only X | None
+        case inspect.UnionType(types=types):  # received messages have no other unions than X | None
             item = next(filter(None, map(_check_of, types)), None)
             return (lambda value: value is None or item(value)) if item is not None else None
     return None
@@ -202,7 +205,7 @@ def _check_of_each(kind: inspect.Type, values: Callable[[Any], Iterable[Any]]) -
     return lambda value: not value or all(map(check, values(value)))
 
 
-# A check of all decimals in a message of that kind.
+# Return a check of all decimals in a message of a kind.
 _plausible: Callable[[Any], Callable[[Any], bool]] = cache(
     lambda kind: _check_of(inspect.type_info(kind)) or (lambda _: True)
 )
@@ -216,33 +219,33 @@ def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     return found
 
 
-_ONCE = json.JSONDecoder(object_pairs_hook=_unique, parse_int=str, parse_float=str)
+_UNIQUE = json.JSONDecoder(object_pairs_hook=_unique, parse_int=str, parse_float=str)
 
 
 def carried(message: Message, kind: type[M], **own: Any) -> M:
-    """A message of `kind` with the fields that `message` has as well, and its `own`."""
+    """Make a message of `kind` from the fields that it shares with `message`, and its `own` fields."""
     return kind(**{name: getattr(message, name) for name in _shared_fields(type(message), kind)} | own)
 
 
 @cache
-def _shared_fields(one: type[Message], other: type[Message]) -> list[str]:
-    names = {*one.__struct_fields__}
-    return [name for name in other.__struct_fields__ if name in names]
+def _shared_fields(source: type[Message], target: type[Message]) -> list[str]:
+    names = {*source.__struct_fields__}
+    return [name for name in target.__struct_fields__ if name in names]
 
 
 def schema(kind: type) -> str:
-    """The name under which a message travels in the encoding."""
+    """The name of a message's kind in the Zenoh encoding."""
     return f"zscout.{kind.__name__}.v1"
 
 
 def exact(value: Decimal, what: str) -> Fraction:
-    """A number that is not negative, exactly. Raises ValueError for NaN, infinity, and implausible sizes."""
+    """Convert a decimal exactly. Raises ValueError for negative numbers, NaN, infinity, and implausible sizes."""
     check_amount(value, what)
     return Fraction(value)
 
 
 def check_amount(value: Decimal, what: str) -> None:
-    """Raises ValueError for what `exact` does not take."""
+    """Raise ValueError for a number that `exact` does not accept."""
     if not value.is_finite():
         raise ValueError(f"{what} must be a number, not {str(value)[:40]}")
     if value < 0:
@@ -255,12 +258,12 @@ def check_amount(value: Decimal, what: str) -> None:
 
 
 def exact_amounts(params: Mapping[str, Decimal]) -> dict[str, Fraction]:
-    """Bandwidth parameters, exactly. Raises ValueError."""
+    """Bandwidth parameters as exact fractions. Raises ValueError."""
     return {name: exact(value, name) for name, value in params.items()}
 
 
 def duration(value: Decimal, what: str) -> Ns:
-    """A positive duration in seconds as whole ns, half to even. Raises ValueError."""
+    """Convert a positive duration from seconds to ns, rounded half to even. Raises ValueError."""
     check_amount(value, what)
     if value > MAX_SECONDS:
         raise ValueError(f"{what} must be at most {MAX_SECONDS} s (ten years), and is {value}")
@@ -271,7 +274,7 @@ def duration(value: Decimal, what: str) -> Ns:
 
 
 def decimals(params: Params) -> Amounts:
-    """Bandwidth parameters as they are sent."""
+    """Bandwidth parameters as decimals, for a message."""
     return {name: Decimal(value.numerator) / Decimal(value.denominator) for name, value in params.items()}
 
 

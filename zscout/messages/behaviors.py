@@ -1,4 +1,4 @@
-"""What behaviors publish about themselves, and a simulated building about its contents, for people to see."""
+"""Publications of behaviors and of a simulated building, for display."""
 
 from __future__ import annotations
 
@@ -23,20 +23,20 @@ Detail: TypeAlias = Annotated[str, Meta(max_length=MAX_DETAIL)]
 
 
 class BehaviorSaid(Message, frozen=True):
-    """What a behavior does from now on, or with `alert`, what people should look at."""
+    """A behavior's present activity, or, with `alert`, an event that needs a person's attention."""
 
     path: Path
     """Its place in the tree of behaviors: `place_sensor_net/scout33/hide`."""
     doing: Word
-    """One word: `search`, `approach`, `watch`; empty when it has ended."""
+    """One word, such as `search`, `approach` or `watch`; empty when the behavior has ended."""
     detail: Detail = ""
     robot: Word = ""
-    """The robot RC, as `robot/scout33`, that it is about."""
+    """The robot RC concerned, such as `robot/scout33`."""
     camera: Word = ""
-    """The framegrabber RC whose pictures `boxes` belong to."""
+    """The framegrabber RC to whose pictures `boxes` refer."""
     alert: bool = False
     boxes: Annotated[list[Box], Meta(max_length=MAX_BOXES)] = []
-    """Where in that picture."""
+    """Regions of the picture concerned, in pixels."""
 
 
 class PlanAsk(Message, frozen=True):
@@ -56,25 +56,25 @@ class BuildingPlan(Message, frozen=True):
 
 
 class Placed(Message, frozen=True):
-    """Where something stands: metres, radians."""
+    """Position and heading of a robot or person: metres, radians."""
 
     name: Word
     x: Metres
     y: Metres
     heading: Radians = 0.0
     camera: int = 0
-    """The video channel that it transmits on; 0: none."""
+    """The video channel on which it transmits; 0: none."""
     hidden: bool = False
-    """Whether it stands in a truly dark place."""
+    """True if it is in a place that is really dark."""
 
 
 class BuildingPoses(Message, frozen=True):
-    """Where robots and people are in a simulated building: the ground truth."""
+    """Positions of robots and people in a simulated building: the ground truth."""
 
     time: Seconds
-    """Of the building, in seconds since it began."""
+    """Simulated time in seconds since the start."""
     speed: Finite = 1.0
-    """How many of the building's seconds pass in a real one."""
+    """Simulated seconds per real second."""
     robots: Annotated[list[Placed], Meta(max_length=MAX_ROBOTS)] = []
     people: Annotated[list[Placed], Meta(max_length=MAX_PEOPLE)] = []
 

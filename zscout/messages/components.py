@@ -1,4 +1,4 @@
-"""Components: operations of nodes, to start, move and stop them, and of the placer."""
+"""Components: operations of nodes (start, move, stop and others), and operations of the placer."""
 
 from __future__ import annotations
 
@@ -12,59 +12,59 @@ from zscout.messages.scheduling import OpenRequest
 from zscout.types import NO_TERM, Metric, Policy, Term
 
 MAX_COMPONENT_NAME = 48
-"""Characters: its client's name is this, a point and the incarnation."""
+"""Characters; the name of a component's client is this name, a point and the incarnation."""
 MAX_PARAMS_SIZE = 16_384
 """Bytes of a component's parameters as JSON."""
 MAX_CHECKPOINT = 4_000_000
 """Bytes of a component's state."""
 MAX_MOVE = 6_000_000
-"""Bytes of a message that carries one: base64 makes four of three."""
+"""Bytes of a message with a checkpoint: base64 turns three bytes into four."""
 MAX_OUTPUT = 65_536
 """Bytes of output that a node keeps of each component."""
 MAX_TAIL = 2_000
-"""Characters of it that are reported with an end."""
+"""Characters of the output that are reported when a component ends."""
 MAX_PLACED = 10_000
 """Components of one fleet."""
 
 Incarnation: TypeAlias = Annotated[int, msgspec.Meta(ge=1, le=MAX_INCARNATION)]
-"""Which start of a component this is: of two the higher counts. Grows over changes of RCM as well."""
+"""Number of a component's start, growing across changes of RCM too; of two incarnations the higher counts."""
 ComponentName: TypeAlias = Annotated[str, msgspec.Meta(min_length=1, max_length=MAX_COMPONENT_NAME)]
 Restart: TypeAlias = Literal["never", "on_failure", "always"]
 
 
 class ComponentSpec(Message, frozen=True):
-    """What a component is, and where and how it is to be kept: the same wherever it runs."""
+    """A component's program, placement and restart policy, independent of the host."""
 
     kind: ShortText
     """The name of an entry point of the group `zscout.components`."""
     params: dict[str, Any] = {}
-    """For the component itself; MAX_PARAMS_SIZE bytes as JSON at most."""
+    """Parameters of the program; at most MAX_PARAMS_SIZE bytes as JSON."""
     restart: Restart = "on_failure"
     metric: Metric = "composite"
     policy: Policy = "pending"
     labels: Annotated[list[ShortText], msgspec.Meta(max_length=MAX_LABELS)] = []
-    """What its host must have."""
+    """Labels required of the host."""
     hosts: Annotated[list[ShortText], msgspec.Meta(max_length=MAX_RANKED)] | None = None
-    """Where it may run; None: anywhere."""
+    """Hosts on which it may run; None: any."""
     memory: Bytes = 0
-    """Bytes that its host must have available."""
+    """Bytes of memory that the host must have available."""
     memory_limit: Bytes = 0
-    """Bytes that it may use with all its processes; 0: as many as there are."""
+    """Bytes that all its processes together may use; 0: no limit."""
     cpu_limit: Figure = 0.0
-    """Cores that it may use with all its processes; 0: as many as there are."""
+    """Cores that all its processes together may use; 0: no limit."""
     owner: Annotated[str, msgspec.Meta(max_length=64)] = ""
-    """Who had it placed, by the name of a certificate: set by the placer. Empty on a mesh without."""
+    """Certificate name of the client that had it placed, set by the placer; empty on a mesh without certificates."""
 
 
 # To a node
 
 
 class StartComponent(Message, frozen=True, tag_field="op", tag="start"):
-    """Starts a component. Answered with a ComponentView once it runs (or stands by), or has failed.
+    """Starts a component. Answered with a ComponentView once it runs, is on standby, or has failed.
 
-    `standby`: it gets ready to take over from an earlier incarnation, and does not run before it is
-    activated, or has been handed an ARC and sees no token of that one. Idempotent: for the same incarnation,
-    answered with its present state."""
+    `standby`: it prepares to take over from an earlier incarnation, and runs only when it is activated, or when it has
+    been handed an ARC and the earlier incarnation's token is gone. Idempotent: for the same incarnation, answered with
+    the present state."""
 
     component: ComponentName
     incarnation: Incarnation
@@ -73,8 +73,8 @@ class StartComponent(Message, frozen=True, tag_field="op", tag="start"):
 
 
 class StopComponent(Message, frozen=True, tag_field="op", tag="stop"):
-    """Ends a component, which is killed after `grace` seconds. Answered with a ComponentView once it has
-    ended. Without `incarnation`, whichever there is; what is not there has ended already."""
+    """Stops a component, and kills it after `grace` seconds. Answered with a ComponentView once it has ended, or if it
+    is not there. Without `incarnation`: any incarnation."""
 
     component: ComponentName
     incarnation: Incarnation | None = None
@@ -82,28 +82,28 @@ class StopComponent(Message, frozen=True, tag_field="op", tag="stop"):
 
 
 class CheckpointComponent(Message, frozen=True, tag_field="op", tag="checkpoint"):
-    """Asks for the state of a component that goes on. Answered with a Checkpoint."""
+    """Asks for the state of a component, which continues to run. Answered with a Checkpoint."""
 
     component: ComponentName
 
 
 class ListComponents(Message, frozen=True, tag_field="op", tag="list"):
-    """Lists the components of a host, ended ones for a while. Answered with a ComponentList."""
+    """Lists the components of a host, including recently ended ones. Answered with a ComponentList."""
 
     component: ComponentName | None = None
-    """Only this one."""
+    """Only this component; None: all."""
 
 
 class ReadOutput(Message, frozen=True, tag_field="op", tag="logs"):
-    """Asks for what a component wrote, from byte `start` of all that it wrote. Answered with an Output."""
+    """Asks for a component's output from byte `start` of all its output. Answered with an Output."""
 
     component: ComponentName
     start: Annotated[int, msgspec.Meta(ge=0)] = 0
 
 
 class MoveComponent(Message, frozen=True, tag_field="op", tag="move"):
-    """Has a running component hand over to incarnation `to_incarnation`, which stands by on `to`. It has
-    `patience` seconds to come to a safe point. Answered with a Moved; on a problem it goes on here."""
+    """Makes a running component hand over to incarnation `to_incarnation`, on standby on host `to`. It has `patience`
+    seconds to reach a safe point. Answered with a Moved; on a problem it continues to run here."""
 
     component: ComponentName
     incarnation: Incarnation
@@ -113,8 +113,8 @@ class MoveComponent(Message, frozen=True, tag_field="op", tag="move"):
 
 
 class RestoreComponent(Message, frozen=True, tag_field="op", tag="restore"):
-    """From the earlier incarnation to the one that stands by: its state, and the ARCs that will be handed to
-    it. Answered with a ComponentView once it has taken the state in; it does not run yet."""
+    """From the earlier incarnation to the incarnation on standby: the state, and the ARCs that will be handed over.
+    Answered with a ComponentView once the state is restored; the component does not run yet."""
 
     component: ComponentName
     incarnation: Incarnation
@@ -123,7 +123,7 @@ class RestoreComponent(Message, frozen=True, tag_field="op", tag="restore"):
 
 
 class ActivateComponent(Message, frozen=True, tag_field="op", tag="activate"):
-    """The earlier incarnation will not go on: this one runs from now on. Answered with a ComponentView."""
+    """Makes an incarnation on standby run: the earlier incarnation runs no longer. Answered with a ComponentView."""
 
     component: ComponentName
     incarnation: Incarnation
@@ -153,22 +153,22 @@ class ComponentView(Message, frozen=True):
     spec: ComponentSpec
     phase: Phase
     movable: bool = False
-    """Whether it can give and take a checkpoint."""
+    """The component can save and restore a checkpoint."""
     uptime: Elapsed = 0.0
-    """Seconds since it was started, or that it lasted."""
+    """Seconds since its start; once it has ended, from start to end."""
     pid: int | None = None
     ended: HowEnded | None = None
     reason: str = ""
-    """Of an end, in words; or which limit this host can't set."""
+    """Why it ended, in words; or the limit that this host can't enforce."""
     tail: str = ""
-    """Of one that failed: the end of its output."""
+    """The last part of its output, if it failed."""
     bad_params: bool = False
-    """It failed because its parameters are no good, on whichever host."""
+    """It failed because of its parameters, and would fail on any host."""
 
 
 class ComponentList(Message, frozen=True):
-    """All components of a host. `kinds` are those that it can start, MAX_KINDS of them at most; None: it does not
-    tell."""
+    """All components of a host. `kinds`: the kinds that it can start, at most MAX_KINDS; None if it does not list
+    them."""
 
     host: str
     components: list[ComponentView] = []
@@ -182,7 +182,7 @@ class Checkpoint(Message, frozen=True):
 
 
 class Output(Message, frozen=True):
-    """What a component wrote, bytes `start` to `end`: what is older than that is lost."""
+    """Output of a component, bytes `start` to `end`; older output is lost."""
 
     component: str
     incarnation: Incarnation
@@ -190,11 +190,11 @@ class Output(Message, frozen=True):
     end: int
     text: str
     over: bool = False
-    """No more will come of this incarnation."""
+    """This incarnation has ended: no more output follows."""
 
 
 class Moved(Message, frozen=True):
-    """A component goes on elsewhere. `dead` seconds lay between its last step here and its first there, on
+    """A component continues on another host. `dead`: seconds between its last step here and its first step there, by
     the clock of the host that it left."""
 
     component: str
@@ -207,8 +207,8 @@ class Moved(Message, frozen=True):
 
 
 class PlaceComponent(Message, frozen=True, tag_field="op", tag="place"):
-    """Has a component run somewhere. Idempotent. Answered with a Placement once it runs or can't, or when
-    `wait` seconds are over."""
+    """Places a component on a host. Idempotent. Answered with a Placement once it runs or can't run, or after `wait`
+    seconds."""
 
     component: ComponentName
     spec: ComponentSpec
@@ -216,14 +216,14 @@ class PlaceComponent(Message, frozen=True, tag_field="op", tag="place"):
 
 
 class EndComponent(Message, frozen=True, tag_field="op", tag="stop"):
-    """Stops a component for good. Answered with a Placement, as above."""
+    """Stops a component for good. Answered with a Placement once it has ended, or after `wait` seconds."""
 
     component: ComponentName
     wait: Elapsed = 10.0
 
 
 class MigrateComponent(Message, frozen=True, tag_field="op", tag="migrate"):
-    """Moves a running component, to host `to` or to the best other one. Answered with a Placement."""
+    """Moves a running component to host `to`, or to the best other host. Answered with a Placement."""
 
     component: ComponentName
     to: ShortText | None = None
@@ -231,20 +231,20 @@ class MigrateComponent(Message, frozen=True, tag_field="op", tag="migrate"):
 
 
 class DrainHost(Message, frozen=True, tag_field="op", tag="drain"):
-    """Nothing is placed on `host` any more, and what can be moved leaves it. Answered with Placements of what
-    is there still; ask again, or `list`, to see it empty."""
+    """Stops placing components on `host`, and moves away those that can move. Answered with Placements of the
+    components still there; repeat it, or `list`, to see when the host is empty."""
 
     host: ShortText
 
 
 class UncordonHost(Message, frozen=True, tag_field="op", tag="uncordon"):
-    """`host` is used again. Answered with Placements of what is there."""
+    """Uses `host` again. Answered with Placements of the components there."""
 
     host: ShortText
 
 
 class ListPlacements(Message, frozen=True, tag_field="op", tag="list"):
-    """Answered with Placements."""
+    """Lists components. Answered with Placements."""
 
     component: ComponentName | None = None
 
@@ -259,34 +259,35 @@ ComponentState: TypeAlias = Literal[
 
 
 class Placement(Message, frozen=True):
-    """A component as the placer knows it. `waiting`: no host will do; `ended`: it completed or was stopped;
-    `given_up`: it failed, and its restart policy or their limit says that is all."""
+    """A component as the placer knows it. `waiting`: no host is suitable; `ended`: it completed or was stopped;
+    `given_up`: it failed, and its restart policy or the limit of restarts allows no restart."""
 
     component: str
     spec: ComponentSpec
     state: ComponentState
     incarnation: Annotated[int, msgspec.Meta(ge=0)] = 0
-    """0: it was never started."""
+    """0 if it was never started."""
     host: str | None = None
     to: str | None = None
-    """Where it is moving."""
+    """The target host of a move."""
     reason: str = ""
-    """In words: why it waits or failed, or why it is where it is."""
+    """Why it waits or failed, or why it runs on its host, in words."""
     movable: bool = False
     wanted: bool = True
-    """Whether it is to run: False once it was stopped."""
+    """False once it was stopped."""
     restarts: int = 0
-    """In a row."""
+    """Restarts in a row."""
     moves: int = 0
     dead: Elapsed | None = None
-    """Seconds that its last move took it out of work."""
+    """Seconds for which its last move interrupted it."""
     tail: str = ""
-    """The end of its output, where it failed."""
+    """The last part of its output, if it failed."""
 
 
 class Placements(Message, frozen=True):
-    """Components by name, and the hosts on which nothing is placed, some for as long as they are in maintenance. Also
-    published at each change: then only what has changed, and `forgotten` names what the placer keeps no longer."""
+    """Components by name. `cordoned`: hosts on which no component is placed; `maintained`: those cordoned only while in
+    maintenance. Also published at each change, with only the changed components; `forgotten` then names components that
+    the placer dropped."""
 
     term: Term = NO_TERM
     components: list[Placement] = []

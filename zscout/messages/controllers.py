@@ -25,7 +25,7 @@ MAX_FIGURES = 32
 MAX_ID = 64
 """Characters of a command's id."""
 MAX_USES = 256
-"""Grants of which one state tells how long the RC was used under them."""
+"""Grants whose use is reported in one state."""
 MAX_FRAME = 2_000_000
 """Bytes of one frame."""
 MAX_REGIONS = 16
@@ -33,7 +33,7 @@ MAX_REGION = 64
 """Numbers of one region."""
 Share: TypeAlias = Annotated[float, Meta(ge=0, le=1)]
 Region: TypeAlias = Annotated[list[Share], Meta(min_length=4, max_length=MAX_REGION)]
-"""x and y of each corner in turn, as shares of the picture's width and height; two corners are opposite ones of a
+"""x and y of each corner in turn, as shares of the picture's width and height; two corners are opposite corners of a
 rectangle."""
 Figures: TypeAlias = Annotated[dict[str, float], Meta(max_length=MAX_FIGURES)]
 
@@ -60,11 +60,11 @@ class Ballot(Message, frozen=True):
 
 
 class Command(Message, frozen=True):
-    """An action `do` under `grant`, to be refused once it has waited longer than `ttl` seconds. Under one `id` a sender
-    has it carried out once, however often it arrives.
+    """An action `do` under `grant`, refused if it has waited longer than `ttl` seconds. Commands of one sender with the
+    same `id` are carried out only once.
 
-    `do` has the action in `name`; the rest is the driver's. Every RC knows `confirm`, `leaving` and `left`. Without a
-    grant only what stops a robot is done, by a radio, for the node of that robot's RC."""
+    `do` has the action in `name`; its other fields are defined by the driver. Every RC knows `confirm`, `leaving` and
+    `left`. Without a grant, a radio only stops a robot, for the node of the robot's RC."""
 
     do: dict[str, Any]
     grant: Grant | None = None
@@ -73,17 +73,17 @@ class Command(Message, frozen=True):
 
 
 class Done(Message, frozen=True):
-    """A command was carried out. `warming` seconds are left until the device has its full use."""
+    """A command was carried out. `warming`: seconds until the device is fully usable."""
 
     result: Any = None
     warming: Seconds = 0.0
     settle: Elapsed | None = None
-    """To a `confirm`: the seconds that the RC settles at most once its client has said `leaving`."""
+    """In an answer to `confirm`: for how many seconds, at most, the RC settles after `leaving`."""
 
 
 class Confirm(Message, frozen=True):
-    """Asks all RCs of a process at once what each would answer to the command `confirm` under `grant`, waiting for no
-    longer than `ttl` seconds."""
+    """Sends the command `confirm` under `grant` to several RCs of a process at once; the answer takes at most `ttl`
+    seconds."""
 
     grant: Grant
     rcs: Annotated[list[str], Meta(max_length=MAX_NEEDS)]
@@ -91,28 +91,29 @@ class Confirm(Message, frozen=True):
 
 
 class Confirmed(Message, frozen=True):
-    """How the RCs answer that are asked about and are here; of others nothing is said."""
+    """The answers of those queried RCs that are in this process."""
 
     done: dict[str, Done] = {}
     refused: dict[str, Problem] = {}
 
 
 class RcAsk(Message, frozen=True):
-    """Queries the state of an RC. With `promise`, an RC that answers obeys no lower term again."""
+    """Queries the state of an RC. With `promise`, an RC that answers never obeys a lower term again."""
 
     promise: Term | None = None
     above: str | None = None
-    """The host of the candidate that asks, where it was refused for a term far above, or an RC that it sees obeys one:
-    the jump is no reason to refuse it then, if its token is seen."""
+    """Host of the asking candidate, if it was refused because of a far higher term, or sees an RC that obeys one: then
+    an RC that sees the candidate's token accepts the jump."""
     instance: str | None = None
-    """That of the RC whose token led to this question: another that answers is not meant, and may not be seen."""
+    """Instance of the RC whose token caused this query: another instance that answers is not meant, and its token may
+    not be visible."""
     ordinary: bool = False
-    """Whether who does not promise answers all the same, with the term that it obeys, instead of `old_term`: an error
-    travels under the key of the question, and where that has a wildcard access control lets none through."""
+    """A process that refuses the promise answers with its state and the term that it obeys, instead of `old_term`: an
+    error is sent under the key of the query, and access control blocks errors under a wildcard key."""
 
 
 class EndedHold(Message, frozen=True):
-    """A hold that ended at the RC by itself: `why` is `time`, `lease` or `failed`."""
+    """A hold that the RC ended: `why` is `time`, `lease` or `failed`."""
 
     id: str
     grant: Grant
@@ -120,17 +121,16 @@ class EndedHold(Message, frozen=True):
 
 
 class HoldUse(Message, frozen=True):
-    """For how many `seconds` an RC was used under a grant so far: from the beginning of the first command that it
-    carried out under it, or frame that it published, to the end of the last; all of the hold if that is direct. It only
-    grows."""
+    """For how many `seconds` an RC was used under a grant so far: from the start of the first command carried out, or
+    frame published, to the end of the last; the whole hold if it is direct. The value never decreases."""
 
     grant: Grant
     seconds: Elapsed = 0.0
 
 
 class Unwell(Message, frozen=True):
-    """Why a device does not work at present, `since` how many seconds, and how many are `left` until its RC counts as
-    lost."""
+    """Why a device does not work at present, for how many seconds (`since`), and how many are `left` until its RC
+    counts as lost."""
 
     why: str
     since: Elapsed
@@ -149,56 +149,57 @@ class RcState(Message, frozen=True):
     holders: list[Holder] = []
     ended: list[EndedHold] = []
     health: str = "ok"
-    """`ok`, or in words what is wrong; an RC that is not ok counts as lost."""
+    """`ok`, or the fault in words; an RC that is not ok counts as lost."""
     rules: int = 0
-    """Grows when what it votes by changes: earlier votes are void."""
+    """Grows when the rules change by which the RC votes: earlier votes are void."""
     leader: bool = False
-    """Whether it sees a leading RCM."""
+    """The RC sees a leading RCM."""
     unwell: Unwell | None = None
-    """While `health` is still ok: its holders go on, and it is granted to operators only."""
+    """Present while `health` is still `ok`: its holders continue, and it is granted only to operators."""
     capacity: Amounts = {}
     figures: Figures = {}
-    """Rates, drops, latency and the like of the device, by name; for people, they decide nothing."""
+    """Rates, drops, latency and the like of the device, by name; only displayed."""
     duplicate_of: str = ""
-    """For which other instance of the RC this one stands by, in words: it holds nothing and is not granted."""
+    """Names the instance for which this instance is on standby: it holds nothing and is not granted."""
     leaving: bool = False
-    """Its device is in its safe state for good: another instance may be taken at once."""
+    """The RC ends, with its device in the safe state: another instance may be used at once."""
     settle: Elapsed | None = None
-    """Seconds that it settles at most after `leaving`; absent: it does not know how to settle."""
+    """Seconds for which the RC settles, at most, after `leaving`; absent if it does not support settling."""
     parameters: Parameters | None = None
-    """All bandwidth parameters that it knows; None: it does not say."""
+    """All bandwidth parameters that the RC knows; None if it does not list them."""
     version: VersionText = ""
     begin_within: Elapsed | None = None
-    """Seconds, at most, from a grant until it has begun, without what settles; absent: it knows nothing of `waits`."""
+    """Seconds, at most, from a grant until the device has begun, not counting settling; absent if the RC does not
+    support `waits`."""
     used: Annotated[list[HoldUse], Meta(max_length=MAX_USES)] = []
-    """Under grants that it holds, and that ended within the last half minute; of others it does not say."""
+    """Use under grants that it holds, and grants that ended within the last half minute."""
 
 
 class MotionLimits(Message, frozen=True):
-    """What of a camera's motion is reported."""
+    """Which motion of a camera is reported."""
 
     ignore: Annotated[list[Region], Meta(max_length=MAX_REGIONS)] = []
-    """Regions of the picture in which motion does not count."""
+    """Regions of the picture in which motion is ignored."""
     min_area: Share = 0.0
-    """Of the picture, in one moving thing."""
+    """Smallest share of the picture that a moving object covers."""
     min_duration: Elapsed = 0.0
 
 
 class FrameHead(Message, frozen=True):
-    """What is attached to a frame; the payload itself is the JPEG."""
+    """The attachment of a frame, whose payload is the JPEG."""
 
     number: int
-    """Of the picture since its source was opened first; a gap means that pictures were not published."""
+    """Number of the picture since the source was first opened; a gap means that pictures were not published."""
     time: Seconds
-    """When the picture was read, by a clock of the framegrabber's own: only differences mean anything."""
+    """Time at which the picture was read, by the framegrabber's own clock: only differences are meaningful."""
     width: int
     height: int
     grant: Grant | None = None
-    """The hold under which it was taken; none while the framegrabber is free."""
+    """The hold under which it was taken; None while the framegrabber is free."""
     source: str = ""
     """The video RC to which the framegrabber is tuned, if it knows several."""
     frozen: Seconds = 0.0
-    """For how long the source has sent this same picture, where it counts as frozen by that."""
+    """Seconds for which the source has sent this same picture; 0 unless it counts as frozen."""
     motion: MotionLimits | None = None
 
 

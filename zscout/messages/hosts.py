@@ -1,4 +1,4 @@
-"""Hosts: how loaded they are, and which is the best."""
+"""Hosts: their loads, and the ranking of hosts for a component."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ from zscout.types import Metric, Policy
 MAX_RANKED = 256
 """Hosts in one answer of the balancer."""
 MAX_LABELS = 32
-"""Of one host."""
+"""Labels of one host."""
 MAX_COMPONENTS = 256
-"""In one load report."""
+"""Components in one load report."""
 
 
 class ComponentUse(Message, frozen=True):
-    """What one component uses, with all its child processes: `cpu` in cores, `memory` in bytes. `served` is
-    the share of the time in which it wanted a processor that it had one; None where nobody knows."""
+    """Resources used by one component with all its child processes: `cpu` in cores, `memory` in bytes. `served` is the
+    share of the time that it got a processor when it wanted one; None if unknown."""
 
     component: ShortText
     kind: ShortText
@@ -44,11 +44,11 @@ class ComponentUse(Message, frozen=True):
 
 
 class LoadReport(Message, frozen=True):
-    """A host's load. `number` counts one reporter's reports; memory in bytes, `cpu` in percent of all.
+    """A host's load. `number` counts one reporter's reports; memory is in bytes, `cpu` in percent of all cores.
 
-    `speed` is how fast one core does a fixed piece of work (`docs/protocol.md`), 1.0 in a millisecond;
-    clocks in MHz, 0 if unknown; `temperature` in degrees Celsius. `certificate_ends_in`: seconds until its node's ends,
-    negative since; `renew`: so near that people are to be told."""
+    `speed` is the speed of one core at a fixed piece of work (`docs/protocol.md`): 1.0 does it in 1 ms. Clocks are in
+    MHz, 0 if unknown; `temperature` is in degrees Celsius. `certificate_ends_in`: seconds until the node's certificate
+    expires, negative if it has; `renew`: this is soon enough to warn people."""
 
     host: str
     number: int
@@ -66,19 +66,19 @@ class LoadReport(Message, frozen=True):
     certificate_ends_in: Seconds | None = None
     renew: bool = False
     version: VersionText = ""
-    """Of the node."""
+    """Version of the node."""
     rights: VersionText = ""
-    """Digest of the rights that the node enforces; empty: none."""
+    """Digest of the rights that the node enforces; empty if it enforces none."""
     fault: Annotated[str, msgspec.Meta(max_length=MAX_ERROR)] = ""
-    """Why the node uses older settings than its files have, with file and key; empty: it does not."""
+    """Why the node uses older settings than its files contain, with file and key; empty if they agree."""
     recorder: Annotated[str, msgspec.Meta(max_length=MAX_ERROR)] = ""
-    """Why the node's recorder writes nothing; empty: it writes, or there is none."""
+    """Why the node's recorder writes nothing; empty if it writes or there is no recorder."""
 
 
 class RankAsk(Message, frozen=True):
-    """Which host is the best for a component of this kind? Only `hosts` where given, else all that report.
+    """Asks which host is the best for a component of `kind`, among `hosts` (absent: all hosts that report).
 
-    `labels` and `memory` (bytes) are what a host must have."""
+    `labels` and `memory` (bytes) are required of a host."""
 
     hosts: Annotated[list[str], msgspec.Meta(max_length=MAX_RANKED)] | None = None
     kind: str = ""
@@ -87,13 +87,13 @@ class RankAsk(Message, frozen=True):
     labels: Annotated[list[str], msgspec.Meta(max_length=MAX_LABELS)] = []
     memory: Bytes = 0
     at_most: Annotated[int, msgspec.Meta(ge=1, le=MAX_RANKED)] = 16
-    """How many hosts are named."""
+    """Number of hosts in the answer."""
     reports: bool = False
-    """Whether the last load report of each host that is named, ranked or left out, is wanted too."""
+    """Include the last load report of each host in the answer, ranked or left out."""
 
 
 class RankedHost(Message, frozen=True):
-    """The greater `score` is the better host; `reason` says it in words."""
+    """A host with a greater `score` is better; `reason` explains the score in words."""
 
     host: str
     score: float
@@ -101,37 +101,38 @@ class RankedHost(Message, frozen=True):
 
 
 class KnownLoad(Message, frozen=True):
-    """The last report of a host, which came `age` seconds ago."""
+    """The last report of a host, received `age` seconds ago."""
 
     age: Elapsed
     report: LoadReport
 
 
 class HostRanking(Message, frozen=True):
-    """Hosts best first, by `metric`; `why` says how that was chosen. `left_out` names hosts that can't be
-    ranked, and why; as many as were asked for of either."""
+    """Hosts, the best first, by `metric`; `why` explains the choice of the metric. `left_out` has hosts that can't be
+    ranked, with the reason. Both have at most as many hosts as the query asked for."""
 
     hosts: list[RankedHost]
     metric: Metric
     why: str
     left_out: dict[str, str] = {}
     more: int = 0
-    """Ranked hosts that are not named."""
+    """Number of ranked hosts that are not listed."""
     reports: list[KnownLoad] | None = None
-    """None: they were not asked for, or the balancer does not know of that."""
+    """None if they were not asked for, or the balancer is too old to send them."""
 
 
 class RecordedAsk(Message, frozen=True):
-    """Asks a recorder where its recording is."""
+    """Asks a recorder for the place of its recording."""
 
 
 class Recorded(Message, frozen=True):
-    """Where a recorder writes, and serves the same live. `file` and `inode` tell whether that is the asker's host."""
+    """The file that a recorder writes, and the address where it serves the same data live. `file` and `inode` let a
+    program find out if this is its own host."""
 
     file: Annotated[str, msgspec.Meta(max_length=4096)]
     inode: int
     bind: Annotated[str, msgspec.Meta(max_length=45)]
-    """IP address that the live view listens on."""
+    """IP address on which the live view listens."""
     port: Annotated[int, msgspec.Meta(ge=1, le=65_535)]
 
 

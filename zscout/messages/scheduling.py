@@ -1,4 +1,4 @@
-"""Operations of clients, and what the RCM answers and publishes."""
+"""Operations of clients, and the answers and publications of the RCM."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ from zscout.messages.base import (
 )
 from zscout.types import NO_TERM, Grant, Place, Term
 
-DOOR_CODES = frozenset({"unknown_device", "unknown_parameter", "too_much"})
-"""What a request is refused with that asked for a `check` and can never start."""
+ADMISSION_CODES = frozenset({"unknown_device", "unknown_parameter", "too_much"})
+"""Codes that refuse a request with `check` which can never start."""
 MAX_KNOWN = 64
-"""Bandwidth parameters that one RC knows."""
+"""Bandwidth parameters of an RC."""
 MAX_GROUPS = 1_000
-"""Groups of which is told what they had."""
+"""Groups whose usage is published."""
 MAX_OTHERS = 255
-"""ARCs that one hand-over takes along, beside the one that it names first."""
+"""ARCs in one hand-over, besides the first."""
 
 
 Seal: TypeAlias = Annotated[str, msgspec.Meta(max_length=128)]
@@ -44,8 +44,8 @@ MAX_COMMENT = 200
 
 
 class Who(Message, frozen=True):
-    """Who asks, by its own word: shown to people, never believed. `host` may be left out: it is that of the client
-    then. `command` is what it runs, `comment` what its user wants others to know."""
+    """The requester's description of itself, displayed but never trusted. `host` defaults to the client's host.
+    `command` is the program that it runs, `comment` a note of its user to others."""
 
     user: Annotated[str, msgspec.Meta(max_length=MAX_WHO)] = ""
     host: Annotated[str, msgspec.Meta(max_length=MAX_WHO)] = ""
@@ -62,8 +62,8 @@ class _ArcParty(Message, frozen=True):
 
 
 class _Wanted(Message, frozen=True):
-    """What a client wants of an ARC: all of `needs`, for at least `min_runtime` seconds. A need is the name of an RC,
-    or a pattern that any one RC meets (`keyexpr.check_need`)."""
+    """An ARC that a client wants: all of `needs` for at least `min_runtime` seconds. A need is the name of an RC, or a
+    pattern, which any RC that matches meets (`keyexpr.check_need`)."""
 
     id: str
     arc: str
@@ -75,69 +75,70 @@ class _Wanted(Message, frozen=True):
 
 class _Asked(_Wanted, frozen=True):
     check: bool = False
-    """Refuse at once what can never start: a need that nobody knows, a parameter that its RC does not know, or more of
-    one than that ever carries. Not with a `place`."""
+    """Refuse a request at once that can never start: an unknown device, a parameter unknown to its RC, or a larger
+    amount than the RC ever carries. Not allowed with a `place`."""
     wait_for_device: bool = False
-    """With `check`: a need that nobody knows is waited for."""
+    """With `check`: wait for unknown devices."""
 
 
 class _Request(_Asked, frozen=True):
-    """All that a client says of a request."""
+    """All that a client sends about a request."""
 
     place: Place | None = None
     waited: Elapsed = 0.0
     estimate: bool = False
-    """Whether notices are to carry `starts_in` while it is queued."""
+    """Notices carry `starts_in` while the ARC is queued."""
     term: Term | None = None
-    """What its client has promised, where an RCM of a lower term answered: that RCM steps down."""
+    """The term that the client has promised, if an RCM of a lower term answered: that RCM steps down."""
     grant: Grant | None = None
-    """What its client believes to hold, or did not enter. A later RCM that was never told of it answers `queued`."""
+    """The grant that the client believes to hold, or did not enter. A later RCM that does not know it answers
+    `queued`."""
     rcs: Annotated[list[str], msgspec.Meta(max_length=MAX_OTHERS)] = []
     """The RCs of `grant`."""
     unconfirmed: Annotated[list[str], msgspec.Meta(max_length=MAX_OTHERS)] = []
-    """Those of them that did not confirm it. If it is still in force, it is revoked, and the ARC is queued with its
-    place."""
+    """Those of `rcs` that did not confirm the grant. If the grant is still in force, it is revoked, and the ARC is
+    queued with its place."""
     reachable: bool = False
-    """One of those has shown itself to the client anew: what was held back for them need wait no more."""
+    """One of `unconfirmed` is visible to the client again: grants held back because of them need wait no longer."""
     direct: bool = False
-    """Its program touches devices past their RCs, which settle when its hold ends."""
+    """The program accesses devices directly rather than through their RCs, which settle when the hold ends."""
     continues: ContinuedArc = ""
-    """The name of another ARC of its client's from which it goes on: a device that passes from that one to this in one
-    step is not made safe in between. Neither is direct."""
+    """The name of another ARC of the client that this ARC continues: a device that passes from the old ARC to the new one
+    in a single step is not made safe in between. Neither ARC may be direct."""
     unserved: bool = False
-    """The time of `grant` went by while RCs of it settled: nobody made use of it."""
+    """The time of `grant` passed while RCs of it settled: it was never used."""
     who: Who | None = None
     seal: Seal | None = None
-    """As its notice had it beside the place."""
+    """Proof of `place`, from the notice with the place."""
     was: RequestId | None = None
-    """The id under which its client had that place, where it is another one now. What is open under it ends."""
+    """The id under which the client had `place`, if it differs from `id`. A request open under it ends."""
     booking: BookingRef = ""
-    """The booking that it takes up, whose needs it has: its id, or as a notice has it."""
+    """The booking that the ARC takes up, with the same needs: its id, or `booking` of a notice."""
 
 
 class OpenRequest(_Request, frozen=True):
-    """A request as its client knows it, for an RCM that takes the lead, or another client that goes on with it. `place`
-    is absent where no RCM has answered. What only an Ask has to say is left out."""
+    """A request as its client knows it, for an RCM that takes the lead, or for a client that takes it over. `place` is
+    absent if no RCM has answered. Fields that only an Ask needs are left out."""
 
 
 class Ask(_Request, frozen=True, tag_field="op", tag="request"):
-    """Asks for an ARC. `id` is the client's own and stays the same however often it asks; `place` is what an earlier
-    RCM gave, and `waited` the seconds since it was last queued there."""
+    """Asks for an ARC. `id` is chosen by the client and is the same in repetitions; `place` is from an earlier RCM, and
+    `waited` the seconds since the ARC was last queued there."""
 
 
 class Cancel(Message, frozen=True, tag_field="op", tag="cancel"):
-    """The ARC is not wanted any more. `client` names its owner where that is not the sender."""
+    """Ends an ARC. `client` names its owner if that is not the sender."""
 
     id: str
     client: str | None = None
     who: Who | None = None
-    """Who ends it, where that is not its owner."""
+    """Describes the sender if it is not the owner."""
     left: bool = False
-    """Its program, where the ARC is direct, is gone: no RC settles for it."""
+    """The program of a direct ARC has ended: no RC settles."""
 
 
 class Release(Message, frozen=True, tag_field="op", tag="release"):
-    """Gives back what a running ARC holds. `client` names its owner where that is not the sender."""
+    """Gives back the RCs of a running ARC. `client` names its owner if that is not the sender."""
 
     id: str
     client: str | None = None
@@ -147,10 +148,10 @@ class Release(Message, frozen=True, tag_field="op", tag="release"):
 
 
 class HandOver(Message, frozen=True, tag_field="op", tag="hand_over"):
-    """The sender's ARC goes on in client `to`: under a new grant if it runs, at its place if it waits.
+    """Moves an ARC of the sender to client `to`: under a new grant if it runs, with its place if it waits.
 
-    `others` are handed over in the same step; those that are not open at the sender are ignored. Idempotent:
-    once it is done, answered with the present state of ARC `id` at `to`."""
+    `others` are handed over in the same step; those not open at the sender are ignored. Idempotent: once done, answered
+    with the present state of ARC `id` at `to`."""
 
     id: str
     to: str
@@ -162,21 +163,21 @@ class Foresee(_Asked, frozen=True, tag_field="op", tag="foresee"):
 
 
 class ReasonParty(_ArcParty, frozen=True):
-    """An ARC that is in another's way, or was preferred to it."""
+    """An ARC that blocks another ARC, or was preferred to it."""
 
     priority: int
     who: Who | None = None
     yields_in: Seconds | None = None
-    """In a reason to wait: seconds until it holds no more, or may be preempted for it, at the latest; absent: not
-    known."""
+    """In a reason to wait: seconds, at most, until this ARC has given way or may be preempted by the waiting ARC;
+    absent if unknown."""
 
 
 class ReasonInfo(Message, frozen=True):
-    """Why an ARC waits, or why a hold or a wait ended: what `reason` says, as data.
+    """Why an ARC waits, or why a hold or a wait ended: `reason` as data.
 
-    `count` counts `rcs`, of which the first three are named (with `patterns` eight), or is a quota; with `vetoed` it
-    counts who is in the way. `detail` is a host, a client or an RC's own words, as `code` has it (`docs/protocol.md`).
-    """
+    `count` is the number of `rcs`, of which the first three are listed (with `patterns` eight), or a quota; with
+    `vetoed` it is the number of ARCs in the way. `detail` is a host, a client or a text of an RC, depending on `code`
+    (`docs/protocol/messages.md`)."""
 
     code: str
     rcs: list[str] = []
@@ -184,31 +185,31 @@ class ReasonInfo(Message, frozen=True):
     detail: str = ""
     count: int = 0
     pattern: str | None = None
-    """The pattern of its needs that is not met; the rest is about one of the RCs that would meet it, or with `patterns`
-    about all of them."""
+    """The need that is not met, if it is a pattern; the other fields are about one of the RCs that would meet it, or
+    with `patterns` about all of them."""
     patterns: list[str] = []
-    """By each of `rcs` the pattern that it is a choice for, empty where the ARC names it; left out where it names all.
-    """
+    """For each of `rcs` the pattern that it would meet, empty if the ARC names the RC; left out if the ARC names
+    all."""
     own: bool = False
-    """With `cancelled` and `released`: its own client ended it."""
+    """With `cancelled` and `released`: the ARC's client ended it."""
 
 
 class Foresight(Message, frozen=True):
-    """The forecast of a request, if no other came. `starts_in` is absent where it would not start as things
-    stand, or not within the horizon of the forecast; `reason` then names what it would wait for."""
+    """The forecast of a request, as if no other request came. `starts_in` is absent if it would not start at present,
+    or not within the horizon of the forecast; then `reason` explains its wait."""
 
     id: str
     arc: str
     starts_in: Seconds | None = None
     preempts: list[str] = []
-    """Names of the ARCs that it would preempt at once."""
+    """Names of the ARCs that the request would preempt at once."""
     reason: str = ""
     begin_within: Elapsed = 0.0
-    """Seconds that its devices need to begin, at most: its runtime counts from then."""
+    """Seconds, at most, until its devices have begun: its runtime counts from then."""
     victims: list[ReasonParty] = []
-    """The same ARCs, and whose they are."""
+    """The ARCs in `preempts`, with their owners."""
     why: ReasonInfo | None = None
-    """What `reason` says, as data."""
+    """`reason` as data."""
 
 
 RequestOperation: TypeAlias = Ask | Cancel | Release | HandOver | Foresee
@@ -221,17 +222,17 @@ class Upcoming(Message, frozen=True):
     code: str
     by: ReasonParty
     rcs: list[str] = []
-    """The RCs of the hold that it is about."""
+    """RCs of the hold that the other needs."""
     safe: Seconds = 0.0
-    """For so many seconds the hold does not end for it; 0 or less: it may end at any time."""
+    """Seconds for which the hold does not yield; 0 or less: it may yield at any time."""
     begins_in: Seconds | None = None
-    """Seconds until the date of a booking or maintenance; 0 or less: it has begun."""
+    """Seconds until the date of a booking or maintenance; 0 or less if it has begun."""
 
 
 class Notice(_ArcParty, frozen=True):
-    """The state of one request: the answer to an operation, and published to its client at each change.
+    """The state of one request: the answer to an operation, and published to the client at each change.
 
-    Of two notices about one request the one with the greater `(term, step)` is the newer."""
+    Of two notices about a request, the one with the greater `(term, step)` is newer."""
 
     state: State
     term: Term
@@ -239,61 +240,62 @@ class Notice(_ArcParty, frozen=True):
     priority: int = 0
     reason: str = ""
     outcome: str | None = None
-    """How the last hold, or the wait, ended."""
+    """How the last hold or wait ended."""
     by: str | None = None
-    """The ARC that it was taken for."""
+    """The ARC for which the hold was ended."""
     place: Place | None = None
     ahead: int | None = None
-    """ARCs that rank before it in the queue."""
+    """Number of ARCs that rank before it in the queue."""
     grant: Grant | None = None
     rcs: list[str] = []
-    """What it holds, or held; of a request that waits, the RCs that it names."""
+    """RCs that the request holds or held; while it waits, the RCs that it names."""
     bound: dict[str, str] = {}
-    """While it runs: the RC that meets each of its patterns."""
+    """While it runs: the RC for each of its patterns."""
     remaining: Seconds | None = None
-    """Seconds until its minimum runtime is over; with `waits`, at the latest."""
+    """Seconds until its minimum runtime is over; at most, if `waits` is present."""
     starts_in: Seconds | None = None
-    """While it is queued, where the client asked for estimates: seconds until it will start if nothing else
-    comes; None where it will not as things stand, or not within what can be forecast."""
+    """While it is queued, if the client asked for estimates: seconds until it starts if no other request comes; None if
+    it would not start at present, or not within the horizon of the forecast."""
     why: ReasonInfo | None = None
     who: Who | None = None
-    """Whose it is, while it is open."""
+    """Describes the owner, while the request is open."""
     seal: str | None = None
-    """Proof that the place is this ARC's, for every RCM; absent where RCMs share no key."""
+    """Proof for other RCMs that `place` belongs to this ARC; absent if the RCMs share no key."""
     hosts: dict[str, str] = {}
-    """While it runs: where its RCs are, by RC, as far as that is known."""
+    """While it runs: the host of each RC, as far as known."""
     booking: BookingRef = ""
-    """The date of a booking that it has taken up: `<id>@<start>`."""
+    """The date of a booking that the request has taken up: `<id>@<start>`."""
     waits: Elapsed | None = None
-    """While it runs and devices of it have not begun: seconds, at most, until they have."""
+    """While it runs and some devices have not begun: seconds, at most, until all have."""
     problem: Problem | None = None
-    """Why it ended, where an RCM that took the lead refuses what its client listed."""
+    """Why an RCM that took the lead refuses a request that the client listed."""
     upcoming: Annotated[list[Upcoming], msgspec.Meta(max_length=MAX_UPCOMING)] = []
-    """While it runs: to which request, and which booking or maintenance, it yields next."""
+    """While it runs: the request, and the booking or maintenance, to which the hold yields next."""
 
 
 class _Hold(_ArcParty, frozen=True, kw_only=True):
-    """What its request gave a hold: `bound` is the RC that meets each of its patterns. On the wire these come last."""
+    """Fields that a hold has from its request; `bound` has the RC for each pattern. On the wire these come last."""
 
     bound: dict[str, str] = {}
     direct: bool = False
-    """As asked: its RCs settle when it ends."""
+    """As in the request: its RCs settle when it ends."""
     continues: ContinuedArc = ""
-    """As asked: what the same client held by that name goes on in it."""
+    """As in the request: the name of the client's ARC that this hold continues."""
     who: Who | None = None
     booking: BookingRef = ""
     protected_from: Seconds | None = None
-    """From when so many seconds of its minimum runtime remain, only operators preempt it; None: no such rule."""
+    """Once no more than this many seconds of the minimum runtime remain, only operators preempt the hold; None if there
+    is no such rule."""
     waits: Elapsed | None = None
-    """Seconds, at most, until its devices have begun: `remaining` counts from then. From an RC: until this one has.
-    None: begun."""
+    """Seconds, at most, until all devices have begun, after which `remaining` counts; from an RC, until this device
+    has. None if begun."""
 
 
 class Holder(_Hold, frozen=True):
-    """One holder of one RC, so complete that a new RCM can recover its ARC from the RCs' states alone.
+    """One holder of one RC, complete enough for a new RCM to recover the ARC from the states of RCs alone.
 
-    `rcs` names the whole gang. `remaining` seconds of its minimum runtime are left, negative where it is over; with
-    `keep` the hold does not end then."""
+    `rcs` names the whole gang. `remaining` is the rest of the minimum runtime in seconds, negative once it is over;
+    with `keep` the hold does not end then."""
 
     grant: Grant
     place: Place
@@ -306,7 +308,7 @@ class Holder(_Hold, frozen=True):
 
 
 class Revocation(_ArcParty, frozen=True):
-    """A hold that is over, by name."""
+    """A hold that ended, by name."""
 
     grant: Grant
     rcs: list[str]
@@ -315,18 +317,18 @@ class Revocation(_ArcParty, frozen=True):
     by: str | None = None
     why: ReasonInfo | None = None
     own: bool = False
-    """Whether its own client gave it back: its program is gone."""
+    """The ARC's client gave it back: its program has ended."""
 
 
 Charged: TypeAlias = Annotated[dict[ShortText, RcSeconds], msgspec.Meta(max_length=MAX_GROUPS)]
 
 
 class Grants(Message, frozen=True):
-    """A publication of the leading RCM. For each RC touched, all its holders from now on, and the `instance` of it that
-    is meant: another one that hears this holds nothing.
+    """A publication of the leading RCM. `rcs` has for each changed RC all its holders from now on; `instances` has the
+    instance of the RC that is meant: any other instance that receives this holds nothing.
 
-    `prev` is the seq of the publication before: a receiver whose last one was another has missed some. Without `rcs`
-    and `revoked` it is a heartbeat; one comes at least every `every` seconds."""
+    `prev` is the seq of the previous publication: a receiver that last received another has missed some. Without `rcs`
+    and `revoked` this is a heartbeat. Publications come at least every `every` seconds."""
 
     term: Term
     seq: int
@@ -336,28 +338,30 @@ class Grants(Message, frozen=True):
     revoked: list[Revocation] = []
     instances: dict[str, str] = {}
     begun: list[tuple[int, Elapsed]] = []
-    """Of each grant of this term that begins with it: its seq, and the seconds for which its ARC was queued. Nobody
-    obeys this: journals keep it."""
+    """For each grant of this term that begins with this publication: its seq, and the seconds for which its ARC was
+    queued. For journals only."""
     time: WallTime | None = None
-    """Fleet time, by which bookings have their dates."""
+    """Fleet time, to which the dates of bookings refer."""
     time_age: Elapsed = 0.0
-    """For how many seconds that time has gone on, over changes of leader and corrections: of two the older counts."""
+    """Seconds for which this fleet time has run, across changes of leader and corrections: of two times the older
+    counts."""
     charged: Charged = {}
-    """With fair shares, now and then: by group the RC-seconds that it lately had and others waited for. Nobody obeys
-    this: candidates go on from it when they lead."""
+    """With fair shares, now and then: recent contended usage per group, in RC-seconds. For candidates only, which start
+    from it when they lead."""
     patience: Elapsed | None = None
-    """Now and then, under `adaptive`: that of an ARC that is queued now. Candidates go on from it."""
+    """Under `adaptive`, now and then: the patience of an ARC queued now, in seconds. Candidates start from it when they
+    lead."""
 
 
 class StateAsk(Message, frozen=True):
-    """Queries the state of the RCM. `arc` (a name or an id) asks for the history of one ARC besides."""
+    """Queries the state of the RCM. `arc` (a name or an id) adds the history of that ARC."""
 
     arc: str | None = None
     holds_only: bool = False
     forecast: bool = False
-    """Whether to estimate when queued ARCs will start."""
+    """Include estimates of the starts of queued ARCs."""
     devices_only: bool = False
-    """Whether only `rcs` is wanted."""
+    """Only `rcs` is wanted."""
 
 
 class _HoldView(_Hold, frozen=True):
@@ -372,14 +376,14 @@ class _HoldView(_Hold, frozen=True):
 
 
 class HoldView(_HoldView, frozen=True, kw_only=True):
-    """A hold in force. `held` is how long it has stood, in seconds; `needs` are by RC. In `ends_in` seconds it is
-    likely to be given back, as such holds usually were, before it is over."""
+    """A hold in force. `held` is its duration so far in seconds; `needs` are by RC. `ends_in`: seconds until it is
+    likely to be given back early, as similar holds were."""
 
     ends_in: Seconds | None = None
 
 
 class WaitView(_ArcParty, frozen=True):
-    """An ARC in the queue, in rank order. `waited` seconds since it was last queued; `needs` as asked."""
+    """An ARC in the queue, in rank order. `waited`: seconds since it was last queued; `needs` as in the request."""
 
     priority: int
     place: Place
@@ -389,7 +393,7 @@ class WaitView(_ArcParty, frozen=True):
     reason: str
     preemptions: int = 0
     starts_in: Seconds | None = None
-    """An estimate, where one was asked for: as if nothing else were to come."""
+    """An estimate, if the query asked for it, as if no other request came."""
     why: ReasonInfo | None = None
     who: Who | None = None
     booking: BookingRef = ""
@@ -401,11 +405,11 @@ class Parameter(Message, frozen=True):
     name: str
     unit: str = ""
     bound: Decimal | None = None
-    """More than this is never carried, whoever holds the RC besides; None: any amount is."""
+    """The most that the RC ever carries, whatever else it carries; None if there is no limit."""
     default: Decimal | None = None
-    """What an ARC books that does not say; None: nothing."""
+    """The amount of an ARC that gives none; None: nothing."""
     unless: list[str] = []
-    """With one of these other parameters `bound` says nothing."""
+    """`bound` does not apply if one of these other parameters is given."""
 
 
 Parameters: TypeAlias = Annotated[list[Parameter], msgspec.Meta(max_length=MAX_KNOWN)]
@@ -416,31 +420,31 @@ class RcView(Message, frozen=True):
     present: bool
     sharable: bool
     holders: list[str] = []
-    """Ids of the ARCs that hold it."""
+    """Ids of the ARCs that hold the RC."""
     host: str = ""
-    """Of the instance that is meant; while there is none, where it was last, or is expected."""
+    """Host of the instance in use; without an instance, the last or expected host."""
     reason: str = ""
-    """Why it is not present, in words."""
+    """Why the RC is not present, in words."""
     gone: Elapsed | None = None
-    """For how many seconds it has not been seen."""
+    """Seconds since the RC was last seen."""
     duplicates: list[str] = []
-    """Hosts that offer it as well, and stand by."""
+    """Hosts with further instances of the RC, on standby."""
     unseen: dict[str, Elapsed] = {}
-    """Hosts that offered it as well, and have not been seen for so many seconds."""
+    """Hosts with instances that are not visible any more, and the seconds since they were last seen."""
     parameters: Parameters | None = None
-    """All bandwidth parameters that it knows; None: it does not say."""
+    """All bandwidth parameters that the RC knows; None if it does not list them."""
 
 
 class StoryLine(Message, frozen=True):
-    """Something that happened to an ARC, `ago` seconds before the answer."""
+    """An event in the history of an ARC, `ago` seconds before the answer."""
 
     ago: Seconds
     text: str
 
 
 class RcmState(Message, frozen=True):
-    """The state of the RCM. `seq` is the last that it published; `more` counts queued ARCs left out. `instances` has
-    the instance that is meant of each RC that is held, and its host."""
+    """The state of the RCM. `seq` is the number of its last publication; `more` counts queued ARCs left out.
+    `instances` has the instance in use of each held RC, and its host."""
 
     term: Term
     seq: int
@@ -462,7 +466,7 @@ class ClientRequests(Message, frozen=True):
     client: str
     requests: list[OpenRequest]
     term: Term = NO_TERM
-    """The highest that it has promised."""
+    """The highest term that the client has promised."""
 
 
 LIMITS[ClientRequests] = MAX_LISTED

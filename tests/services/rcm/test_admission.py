@@ -156,8 +156,8 @@ async def test_a_list_or_a_state_that_is_too_long_is_not_decoded_and_harms_nobod
     state = await fleet.state()
     assert [(item.client, item.arc) for item in state.holds] == [("bob/one", "held")]
     assert not [item for item in state.queue if item.client == "eve/two"]
-    assert f"at most {MAX_LISTED} are taken" in caplog.text
-    assert f"at most {MAX_HELD} are taken" in caplog.text
+    assert f"at most {MAX_LISTED} are accepted" in caplog.text
+    assert f"at most {MAX_HELD} are accepted" in caplog.text
     await served(bob, "robot/b")
     # What it asks for itself is as good as anybody's.
     flood.open = []

@@ -68,7 +68,7 @@ class BookingFile:
         found: list[messages.BookingRecord] = []
         for raw in kept.records:
             try:
-                found.append(messages.decode_told(bytes(raw), messages.BookingRecord))
+                found.append(messages.decode_received(bytes(raw), messages.BookingRecord))
             except messages.Malformed as error:
                 log.warning("a booking in %s can't be read, and is left out: %s", self._path, error)
         if len(found) < len(kept.records):

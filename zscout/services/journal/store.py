@@ -256,7 +256,7 @@ class JournalStore:
         more: messages.Cursor | None = None
         size = 0
         for row in db.execute(sql, (*conditions, asked.limit + 1)):
-            if len(holds) == asked.limit or size > messages.MAX_TOLD_BYTES:
+            if len(holds) == asked.limit or size > messages.MAX_HISTORY_BYTES:
                 more = last
                 break
             hold = _hold(row[1:])

@@ -21,7 +21,7 @@ from zscout.config.strict import BadInput, read_bytes
 from zscout.keyexpr import Role, Token
 from zscout.mesh import Mesh
 from zscout.mesh.supervision import Supervisor
-from zscout.messages import MAX_STATE, Malformed, RcmState, RcState, StateAsk, decode_told, encode
+from zscout.messages import MAX_STATE, Malformed, RcmState, RcState, StateAsk, decode_received, encode
 from zscout.rcm.devices import ExpectedDevices, SeenHome, homes_in
 from zscout.types import SECOND, Ns
 
@@ -106,7 +106,7 @@ class Inventory:
         if self._file is None or not self._file.exists():
             return
         try:
-            kept: _DeviceFile = decode_told(read_bytes(self._file, max_bytes=MAX_STATE), _DeviceFile)
+            kept: _DeviceFile = decode_received(read_bytes(self._file, max_bytes=MAX_STATE), _DeviceFile)
         except (BadInput, Malformed) as error:
             log.warning("%s can't be read, and is not used: %s", self._file, error)
             return

@@ -11,7 +11,7 @@ import msgspec
 
 from zscout.config.state_folder import write_durably
 from zscout.config.strict import BadInput, read_bytes
-from zscout.messages import MAX_COUNTER, Malformed, decode_told, encode
+from zscout.messages import MAX_COUNTER, Malformed, decode_received, encode
 from zscout.rcm.terms import Terms
 from zscout.types import NO_TERM, Term
 
@@ -45,7 +45,7 @@ class TermFile:
         if not self._path.exists():
             return NO_TERM
         try:
-            kept: _TermFile = decode_told(read_bytes(self._path, max_bytes=MAX_BYTES), _TermFile)
+            kept: _TermFile = decode_received(read_bytes(self._path, max_bytes=MAX_BYTES), _TermFile)
         except (BadInput, Malformed) as error:
             log.warning("%s can't be read, and is not used: %s", self._path, error)
             return NO_TERM
