@@ -198,7 +198,7 @@ async def wait_for_grant(client: Client, wanted: HoldOptions, report: Report, ar
 async def _give_up_once_queued(client: Client, arc: OpenArc, limit: asyncio.Timeout) -> None:
     """Let `limit` pass as soon as the leader has decided that `arc` waits."""
     loop = asyncio.get_running_loop()
-    while arc.state != "queued" or (arc.why is not None and arc.why.code in UNDECIDED):
+    while arc.state != "queued" or _undecided(arc):
         limit.reschedule(None if arc.state == "running" else loop.time() + ANSWERS)
         await client.changed(arc)
     limit.reschedule(loop.time())
@@ -461,8 +461,10 @@ class Report(LiveLine):
         self._mesh = client.mesh
         self._arc: OpenArc | None = None
         self.changed = asyncio.Event()
-        self._printed: object = None
-        """How it waited by the last line that stays."""
+        self._printed: tuple[str, str, int | None] | None = None
+        """State, reason and place in the queue by the last line that stays."""
+        self._settling: object = None
+        """The grant whose start was reported."""
         self._state: RcmState | None = None
         """As it was `_looked` at, when `_seen` was the newest notice."""
         self._looked: Ns | None = None
@@ -494,6 +496,7 @@ class Report(LiveLine):
             self.hide()
 
     async def follow_wait(self) -> None:
+        self._printed = None
         while True:
             if self._looked is not None and self._arc is not None and self._arc.state == "queued":
                 # One look per REFRESH: news may come in a crowd.
@@ -505,6 +508,8 @@ class Report(LiveLine):
             elif arc.state == "running" and (arc._settling == arc.grant or arc.ready is not None):
                 self._show_settling(arc)
             elif arc.state in ("asking", "queued") and arc.reason:
+                if not self.watched and _undecided(arc) and await done_within(REFRESH, self.changed.wait()):
+                    continue  # decided a moment later
                 news = arc._last != self._seen if self.watched else _how(arc) != self._printed
                 if arc.state == "queued" and news:
                     self._looked, self._seen = self._mesh.now(), arc._last
@@ -560,8 +565,10 @@ class Report(LiveLine):
         # Without the estimate: it changes all the time.
         if self.watched or self._printed == _how(arc):
             return
-        self._printed = _how(arc)
-        text = "; ".join(filter(None, (words, ahead, start, *holders)))
+        before, self._printed = self._printed, _how(arc)
+        if before is not None and before[:2] == self._printed[:2]:  # one line for each reason
+            words, ahead = f"{arc.name} waits: {ahead or 'nobody ahead'}", ""
+        text = "; ".join(filter(None, (words, ahead, start)))
         stand = [need.as_json() for need in needs]
         self.event(
             "waits", text, id=arc.id, reason=arc.reason, why=arc.why, ahead=arc.ahead, starts_in=starts_in, needs=stand
@@ -571,8 +578,8 @@ class Report(LiveLine):
         ready_in = None if arc.ready is None else round(max(0, arc.ready - self._mesh.now()) / SECOND, 3)
         why = arc.reason if ready_in is None else starting(ready_in)
         self.draw(f"{arc.name} is granted {held_text(arc)}, and waits {span(self._since(arc))}: {why}")
-        if self._printed != arc.grant:
-            self._printed = arc.grant
+        if self._settling != arc.grant:
+            self._settling, self._printed = arc.grant, None
             text = "" if self.watched else f"{arc.name} is granted {held_text(arc)}, and waits: {why}"
             details = {"grant": arc.grant, "reason": why, "ready_in": ready_in}
             self.event("settling", text, id=arc.id, rcs=arc.rcs, **details)
@@ -581,8 +588,12 @@ class Report(LiveLine):
         return (self._mesh.now() - arc.since) / SECOND
 
 
-def _how(arc: OpenArc) -> object:
+def _how(arc: OpenArc) -> tuple[str, str, int | None]:
     return arc.state, arc.reason, arc.ahead
+
+
+def _undecided(arc: OpenArc) -> bool:
+    return arc.why is not None and arc.why.code in UNDECIDED
 
 
 def held_text(held: OpenArc | Held) -> str:
