@@ -6,7 +6,7 @@
    later time, again, or never. RCs obey as in ownership.tla, which says that nobody else is obeyed by them: other
    programs are here for nothing but that a hold may end. So may an RC be lost from a leader's sight, or forget its hold.
 
-   GUARDS names the guards that are in force, as in docs/promises.md: taking one out must break a promise. *)
+   GUARDS names the guards that are in force, as in docs/promises/guards.md: taking one out must break a promise. *)
 EXTENDS Naturals, Sequences, FiniteSets
 
 CONSTANTS

@@ -11,7 +11,7 @@
    may be sent under any grant that ever was, by whoever believes in it.
 
    GUARDS names the guards of the protocol that are in force: taking one out must break an invariant
-   (docs/promises.md lists which). *)
+   (docs/promises/guards.md lists which). *)
 EXTENDS Naturals, Sequences, FiniteSets
 
 CONSTANTS

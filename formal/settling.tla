@@ -7,7 +7,7 @@
    file. Time goes in steps, without end, by one clock: what clocks run apart is the difference of Settle and Grace.
    Times are kept as what is left of them.
 
-   GUARDS names the guards that are in force, as in docs/promises.md: taking one out must break `Alone`. *)
+   GUARDS names the guards that are in force, as in docs/promises/guards.md: taking one out must break `Alone`. *)
 EXTENDS Integers, FiniteSets
 
 CONSTANTS

@@ -17,7 +17,7 @@ from typing import Final
 
 HERE: Final = Path(__file__).parent
 GUARDS: Final = ("fence", "above", "older", "ended", "grant", "whole", "over", "known")
-"""The guards of the protocol that the model has; what each is stands in docs/promises.md."""
+"""The guards of the protocol that the model has; what each is stands in docs/promises/guards.md."""
 SETTLING: Final = ("settling", "confirmed", "deadline", "remembered")
 """Those of `settling.tla`."""
 ENTERING: Final = ("confirm", "waits", "by name", "newer")
