@@ -50,7 +50,7 @@ MISSED = {
     "begun": 35, "begun heard": 35, "words": 6, "doubted": 46, "sealed terms": 56, "back": 76, "budget": 6,
     "tolerated": 15, "unwell": 15, "denied": 900665,
 }  # fmt: skip
-"""Guards without which some promise breaks within a few runs, and the seed of docs/promises/guards.md, which is tried first;
+"""Guards without which some promise breaks within a few runs, and the seed of docs/promises/guards.md, tried first;
 `python -m studies faults --without` tries the others."""
 
 
