@@ -1,4 +1,4 @@
-"""Every command of `zscout` by every role on a secured fleet, as the table of docs/operations.md has it."""
+"""Every command of `zscout` by every role on a secured fleet, as the table of docs/reference/roles.md has it."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from tests.live.closed import ClosedLab
 from tests.live.test_doors import env_of
 from zscout.cli.main import main
 
-PAGE: Final = (Path(__file__).parents[2] / "docs" / "operations.md").read_text()
-SECTION: Final = PAGE[PAGE.index("## Who may run which command") : PAGE.index("## Add a host")]
+PAGE: Final = (Path(__file__).parents[2] / "docs" / "reference" / "roles.md").read_text()
+SECTION: Final = PAGE[PAGE.index("## The table") : PAGE.index("## Rights of each role")]
 ROW: Final = re.compile(r"\| `([a-z ]+)` \| (\w+) \| (\w+) \| (\w+) \| (\w+) \|")
 TABLE: Final = {match[1]: match.groups()[1:] for match in ROW.finditer(SECTION)}
 NAMES: Final = {"wall": "viewer", "eve": "client", "ada": "operator", "cart": "node"}
