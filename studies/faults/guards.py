@@ -302,7 +302,10 @@ GUARDS: Final[Mapping[str, Guard]] = MappingProxyType(
         "reopen": Guard("who was dropped and lives goes on at its place", {(RequestLog, "reopens"): _no}),
         "places": Guard("a client shows the place that it had", {(OpenArc, "_as_asked"): _without_place}),
         "claims": Guard("of the ARCs that claim one place one runs", {(SchedulerState, "_is_first"): _yes}),
-        "unheard": Guard("what had its time unheard is asked for anew", {(RequestStore, "_ask_anew"): _nothing}),
+        "unheard": Guard(
+            "a request whose time passed unnoticed is submitted again",
+            {(RequestStore, "_submit_under_new_id"): _nothing},
+        ),
         "notices": Guard("of two notices the newer counts", {(OpenArc, "_take"): _take_any}),
         "terms": Guard("a client believes nothing of an older term", {(RcmLink, "accept"): _accept_any}),
         "absurd": Guard(

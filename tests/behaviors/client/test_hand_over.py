@@ -180,7 +180,7 @@ async def test_what_is_awaited_once_more_is_handed_on() -> None:
         arc = await one.request("work", {"robot/z": {}}, min_runtime=3600)
         before = arc.id, arc._place
         # As if it had come in this term, and a later RCM knew it as another client's.
-        arc._came = arc._last[0]
+        arc._moved_in = arc._last[0]
         told = Notice(arc.id, arc.name, "h/one", "ended", Term(arc._last[0].counter + 1, "later"), 1)
         one._store.take(arc, replace(told, outcome="handed_over"))
         assert (arc.state, one.internals.open_requests()) == ("awaited", [])

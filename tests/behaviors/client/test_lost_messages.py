@@ -15,7 +15,7 @@ from zscout.behaviors.client import rcm_link
 from zscout.behaviors.client.arc import hold
 from zscout.behaviors.client.client import Client
 from zscout.behaviors.client.confirmation import CONFIRM_TIMEOUT
-from zscout.behaviors.client.internals import REJOINS, TOLD_WITHIN
+from zscout.behaviors.client.internals import NOTICE_TIMEOUT, REJOIN_TIMEOUT
 from zscout.behaviors.client.request import CommandRefused
 from zscout.messages import Command
 from zscout.scheduling.model import HOLD_BACK
@@ -144,7 +144,7 @@ async def test_what_was_granted_again_unheard_is_given_back_by_who_had_its_time(
         await until(lambda: fleet.rcs[0].holds.held)
         await body
         fleet.network.disturb({})
-        await asyncio.sleep(TOLD_WITHIN + 0.5)
+        await asyncio.sleep(NOTICE_TIMEOUT + 0.5)
         assert not fleet.rcs[0].holds.held
         assert not (await fleet.state()).holds
 
@@ -222,7 +222,7 @@ async def test_a_command_that_was_long_under_way_as_its_session_closed_is_sent_a
         async def closes_first(key: str, *args: Any, **kwargs: Any) -> Any:
             asked.append(key)
             if len(asked) == 1:
-                await asyncio.sleep(REJOINS + 0.1)
+                await asyncio.sleep(REJOIN_TIMEOUT + 0.1)
                 return None
             return await ask_one(key, *args, **kwargs)
 

@@ -101,7 +101,7 @@ class BlockingHeld:
         self._body.waits = True
         try:
             await asyncio.wrap_future(self._lab.submit(self._held.over()))
-            self._body.told = True
+            self._body.notified = True
         finally:
             self._body.waits = False
 
@@ -119,7 +119,7 @@ class BlockingHeld:
         if self._lab.forked:
             raise RuntimeError(FORKED)
         if not self.active:
-            self._body.told = True
+            self._body.notified = True
             raise self._revoked()
 
     def wait(self, timeout: float | None = None) -> bool:
@@ -127,7 +127,7 @@ class BlockingHeld:
         self._body.waits = True
         try:
             over = self._lab.run(self._over_within(timeout))
-            self._body.told |= over
+            self._body.notified |= over
         finally:
             self._body.waits = False
         return over
@@ -233,7 +233,7 @@ class BlockingAttempt(AbstractContextManager[BlockingHeld, None]):
         assert held is not None  # noqa: S101 - entered before left
         if self._lab.forked:
             return
-        unknown = kind is None and not held.active and not held.completed and not held._body.told
+        unknown = kind is None and not held.active and not held.completed and not held._body.notified
         revoked = held._revoked() if unknown else None
         self._leave()
         if revoked is not None:
@@ -270,7 +270,7 @@ class BlockingAttempt(AbstractContextManager[BlockingHeld, None]):
             log.warning(
                 "%s cleans up too long after its hold; interrupting it, the next holder begins", direct.arc.name
             )
-            held._body.told = False
+            held._body.notified = False
             await held._body.interrupt()
 
     async def _give_up(self, held: BlockingHeld) -> None:

@@ -1,4 +1,4 @@
-"""A program's side of the mesh: requests ARCs, follows what becomes of them, commands what it holds."""
+"""A program's connection to the mesh: requests devices, follows the requests, and commands held devices."""
 
 from __future__ import annotations
 
@@ -38,9 +38,9 @@ __all__ = ["QUERY_TIMEOUT", "TRY_AGAIN", "Client", "CommandRefused", "NoRcm", "R
 log = logging.getLogger(__name__)
 
 LOOK_FOR_RCM: Final = 3.0
-"""Seconds in which a mesh that has an RCM shows it."""
+"""Seconds within which an existing leader is visible."""
 LOOK_FOR_TAKEOVER: Final = 5.0
-"""The same where a candidate is seen."""
+"""Seconds to wait for a leader if a node is visible that may lead."""
 MAX_NAMED: Final = 5
 
 
@@ -120,14 +120,14 @@ class Client:
                 return
             if candidates and await done_within(max(0.0, takeover - seconds), seen.wait()):
                 return
-        nobody = f"no leader is on the mesh of fleet {self.fleet.name}"
+        no_leader = f"no leader is on the mesh of fleet {self.fleet.name}"
         if candidates:
             names = ", ".join(sorted(token.host for token in candidates)[:MAX_NAMED])
-            raise NoRcm(f"{nobody}, though {names} could lead; see the log of zscout-node there")
+            raise NoRcm(f"{no_leader}, though {names} could lead; see the log of zscout-node there")
         links = self.mesh.links()
-        who = f"{links} link{'s' * (links > 1)} to other programs" if links else "no other program either"
+        others = f"{links} link{'s' * (links > 1)} to other programs" if links else "no other program either"
         raise NoRcm(
-            f"{nobody} ({who}); start zscout-node on a host, or check the fleet file (${FLEET_VARIABLE}): "
+            f"{no_leader} ({others}); start zscout-node on a host, or check the fleet file (${FLEET_VARIABLE}): "
             "`zscout doctor` finds the cause"
         )
 
@@ -181,20 +181,20 @@ class Client:
             arc._check, arc._wait_for_device = True, self._waits(wait_for_device)
             self._store.add(arc)
         elif estimate:
-            # Nobody has said that of it here: from the next asking on.
+            # The request was handed over without it: the next submission asks for estimates.
             arc.estimate = True
         try:
             await self._rcm.submit(arc)
         except BaseException as error:
             self._store.forget(arc)
             if not isinstance(error, RequestRefused):
-                # The RCM may have it.
+                # The RCM may have the request.
                 self._supervisor.spawn(self._rcm.give_back(messages.Cancel(id=arc.id)))
             raise
         return arc
 
     def _protected(self, min_runtime: float | Decimal | None) -> Decimal:
-        """In seconds; what nobody gave is the fleet's. Raises ValueError."""
+        """Return `min_runtime` in seconds, by default the fleet's. Raises ValueError."""
         if min_runtime is not None:
             check_seconds("min_runtime", min_runtime)
         return Decimal(self.fleet.min_runtime) / SECOND if min_runtime is None else Decimal(str(min_runtime))
@@ -207,11 +207,12 @@ class Client:
         await self._store.changed(arc)
 
     async def granted(self, arc: OpenArc, *, confirmed: bool = False) -> Grant | None:
-        """Wait until the request `arc` is granted. Return None if it ended instead. Its devices are asked at the same
-        time whether they know of the grant. If one does not confirm it within a second, the grant is withdrawn and the
-        request waits again. With `confirmed`, and for a direct request, return only when all devices have confirmed the
-        grant, which they do once they are ready. Raises CommandRefused if a device refuses it for a reason that does
-        not pass with time."""
+        """Wait until the request `arc` is granted, and return the grant; None if the request ended instead.
+
+        Meanwhile its devices are asked to confirm the grant. If one does not within a second, the grant is withdrawn
+        and the request waits again. With `confirmed`, and for a direct request, return only when all devices have
+        confirmed the grant, which they do once they are ready. Raises CommandRefused if a device refuses it for a
+        reason that does not pass with time."""
         while True:
             await self._store.resumed.wait()
             if not arc.open:
@@ -239,16 +240,16 @@ class Client:
         """Pass one request, queued or running, to the client `to`. Raises RequestRefused."""
         reply = await self._rcm.query(messages.HandOver(id=arc.id, to=str(to)))
         if reply is None or reply.message is None:
-            unknown = Problem("unknown", "the leader did not answer; ask how the request stands")
+            unknown = Problem("unknown", "the leader did not answer; the request may or may not have passed")
             raise RequestRefused(reply.problem or unknown if reply is not None else unknown)
 
-    # Operators' questions
+    # Queries
 
     async def state(
         self, arc: str | None = None, *, forecast: bool = False, timeout: float = QUERY_TIMEOUT
     ) -> RcmState | None:
-        """Return the leader's state: what is held and what waits. None if no leader answered in `timeout` seconds. With
-        `arc`, the state includes the history of that request; with `forecast`, the estimated starts."""
+        """Return the leader's state: devices, holds and the queue. None if no leader answered within `timeout` seconds.
+        With `arc` (a request's id) it includes that request's history; with `forecast`, the estimated starts."""
         asked = messages.StateAsk(arc=arc, forecast=forecast)
         reply = await self.mesh.ask_one(self.mesh.keys.ask_state(self.mesh.me), asked, RcmState, timeout=timeout)
         return reply.message if reply is not None else None
@@ -263,8 +264,8 @@ class Client:
         keep: bool = True,
         wait_for_device: bool | None = None,
     ) -> Foresight | None:
-        """Return what a request would lead to, without making it. None if no leader answered. Takes what `request`
-        takes. Raises RequestRefused."""
+        """Return the consequences that a request would have, without making it (a dry run). None if no leader answered.
+        The arguments are those of `request`. Raises RequestRefused."""
         if self.mesh.keys.closed and (why := self.fleet.access.refusal(self.mesh.me.host, "request devices", USERS)):
             raise RequestRefused(Problem("not_allowed", why))
         seconds = self._protected(min_runtime)
@@ -281,9 +282,9 @@ class Client:
     async def command(
         self, rc: str, grant: Grant, do: Mapping[str, Any], *, ttl: float = 1.0, timeout: float = 2.0
     ) -> Done:
-        """Have the device `rc` carry out a command under `grant`, and return its answer: `result` is what it returned.
-        A device that does not know of the grant yet, or is not ready yet, has `ttl` seconds to become so. Waits
-        `timeout` seconds for the answer. Raises CommandRefused."""
+        """Have the device `rc` carry out a command under `grant`, and return its answer; its `result` is the device's
+        result. If the device does not know the grant yet, or is not ready, the command waits there for at most `ttl`
+        seconds. `timeout`: seconds to wait for the answer. Raises CommandRefused."""
         began = self.mesh.now()
         try:
             return await self.internals.command(rc, grant, do, ttl=ttl, timeout=timeout)
@@ -301,7 +302,7 @@ C = TypeVar("C", bound=Client)
 
 
 class Connecting(Coroutine[Any, Any, C], Generic[C]):
-    """A client on its way to the mesh: await it, or enter it, which closes it at the end of the body."""
+    """The result of `Client.connect`: await it, or use it with `async with`, which closes the client."""
 
     def __init__(self, connecting: Coroutine[Any, Any, C]) -> None:
         self._connecting = connecting
@@ -318,7 +319,7 @@ class Connecting(Coroutine[Any, Any, C], Generic[C]):
         if self._client is not None:
             await self._client.close()
 
-    # A coroutine as before, which a task can run.
+    # It is a coroutine too, so that a task can run it.
 
     def send(self, value: Any) -> Any:
         return self._connecting.send(value)

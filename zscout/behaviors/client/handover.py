@@ -1,8 +1,8 @@
-"""A client that moves: paused, it hands all that it has to another one, which expects it.
+"""Hand-over of all requests from a paused client to a new client, which expects them.
 
-The RCM's answer to the hand-over is the commit point. Before it the old client can go on as if nothing had
-been; after it only the new one, unless that is gone: then the old one takes back, and asks anew. An RCM that dies as it
-answers may take along what it told everybody else: what the new client has not heard of is handed over again.
+The RCM's answer to the hand-over is the commit point. Before it, the old client can continue unchanged. After it, only
+the new client has the requests; if the new client is gone, the old client takes them back and submits them again. If an
+RCM dies while it answers, the new client may never be notified: requests without a notice there are handed over again.
 """
 
 from __future__ import annotations
@@ -26,38 +26,38 @@ log = logging.getLogger(__name__)
 HAND_OVER = 10.0
 """Seconds within which the outcome of a hand-over must be known."""
 FIRST_PAUSE = 0.005
-"""Seconds before a hand-over is asked again, doubling: a notice comes about as soon as the answer."""
+"""Seconds before a hand-over is repeated, doubling: the new client's notice arrives about as soon as the answer."""
 EXPECT_TIMEOUT = 2.0
-"""Seconds for which a request waits for the ARC that is expected in its stead."""
+"""Seconds for which `claim` waits for an expected ARC."""
 TOKEN_GRACE = 1.0
 """Seconds within which the RCM sees the token of a client that sees the RCM's."""
 CLAIM_TIMEOUT = 10.0
-"""Seconds after which an ARC that came and that nobody asked for is given back."""
+"""Seconds after which an unclaimed ARC that was handed over is given back."""
 
 
 class MovableClient:
-    """What a client hands over, and what it expects to be handed over to it."""
+    """The base of a client that can hand over its requests, and receive those of another client."""
 
     def __init__(self, mesh: Mesh, fleet: Fleet, supervisor: Supervisor) -> None:
         self.mesh, self.fleet, self.supervisor = mesh, fleet, supervisor
         self.store = RequestStore(mesh.now, self._ask_soon)
         self.rcm = RcmLink(mesh, fleet, self.store, supervisor)
         self.expected_came = asyncio.Event()
-        """Set at the first notice of an ARC that is expected: from then on it is this client's."""
+        """Set at the first notice of an expected ARC, which from then on belongs to this client."""
         self._unclaimed: dict[str, OpenArc] = {}
-        """What is expected, come or not, and was not asked for yet."""
+        """Expected requests, handed over or not, that the program has not claimed yet."""
         self._may_end = asyncio.Event()
-        """Set unless the client is paused, and once it has left."""
+        """Cleared while the client is paused, until it leaves."""
         self._may_end.set()
 
     # The new client
 
     def expect(self, requests: Sequence[OpenRequest]) -> None:
-        """These will be handed to this client: `request` then returns them, by name and needs. They replace
-        what was expected before and has not come.
+        """Expect another client to hand over `requests`; `request` then returns them, by name and needs. They replace
+        those expected before and not yet handed over.
 
-        What has come and was not asked for within 10 s is given back. Raises BadName, and ValueError for more
-        than 256 of them, or for one that is open here."""
+        A request that was handed over and not claimed within 10 s is given back. Raises BadName, and ValueError for
+        more than 256 requests, or one that is already open here."""
         if len(requests) > MAX_OTHERS + 1:
             raise ValueError(f"{len(requests)} requests are too many to take over; at most {MAX_OTHERS + 1} are")
         now = self.mesh.now()
@@ -73,7 +73,7 @@ class MovableClient:
         self.expected_came.clear()
 
     def take_moving(self, notice: Notice) -> bool:
-        """Applies a notice of what is expected, or was handed over. False if it is of neither."""
+        """Apply a notice of a request that is expected, or was handed over. Return False if it is of neither."""
         if (arc := self.store.expected.get(notice.id)) is not None:
             if arc._take_first(notice, self.mesh.now()):
                 self.store.adopt(arc)
@@ -83,7 +83,7 @@ class MovableClient:
             return True
         arc = self.store.moved.get(notice.id)
         if arc is not None and notice.state == "ended" and notice.outcome != "handed_over":
-            # It was over before it could be handed over: there is nothing to take back.
+            # It ended before it could be handed over: there is nothing to take back.
             arc._finish(notice.outcome or "lost", notice.reason, self.mesh.now())
             self.store.notify(arc)
             self.store.forget(arc)
@@ -91,22 +91,22 @@ class MovableClient:
         return False
 
     async def claim(self, name: str, needs: dict[str, Amounts]) -> OpenArc | None:
-        """The ARC of this name and these needs that is expected, once it has come; None if there is none."""
+        """Return the expected ARC with this name and needs once it has been handed over; None if there is none."""
         unclaimed = self._unclaimed.values()
         arc = next((arc for arc in unclaimed if (arc.name, arc.needs) == (name, needs)), None)
         if arc is None:
             return None
         del self._unclaimed[arc.id]
         try:
-            await self._come(arc)
+            await self._await_handover(arc)
         finally:
             if arc.id in self.store.expected:
                 self.store.forget(arc)
         return arc if arc.open else None
 
-    async def _come(self, arc: OpenArc) -> None:
-        """Waits for what is expected. What does not come may have been handed over unheard: it is to be asked for,
-        under its id, at its place."""
+    async def _await_handover(self, arc: OpenArc) -> None:
+        """Wait until an expected ARC is handed over. After EXPECT_TIMEOUT, adopt it to submit it, under its id and at
+        its place: it may have been handed over without this client's notice."""
         try:
             async with asyncio.timeout(EXPECT_TIMEOUT):
                 while arc.id in self.store.expected:
@@ -119,7 +119,7 @@ class MovableClient:
         self.supervisor.spawn(self._await_again(arc) if arc.state == "awaited" else self.ask_again(arc))
 
     async def _await_again(self, arc: OpenArc) -> None:
-        await self._come(arc)
+        await self._await_handover(arc)
         if arc.open:
             await self.ask_again(arc)
 
@@ -128,20 +128,20 @@ class MovableClient:
         if self._unclaimed.get(arc.id) is arc:
             del self._unclaimed[arc.id]
             if arc.open:
-                log.warning("%s was handed over and nobody asked for it: it is given back", arc.name)
+                log.warning("giving back %s: it was handed over, and not requested here", arc.name)
                 await self.rcm.end(arc)
 
     # The old client
 
     def pause(self) -> None:
-        """From now on nothing is asked again or ended and no body is entered or interrupted, until `resume`,
-        `take_back`, `close` or `leave`. Notices are taken as before."""
+        """Until `resume`, `take_back`, `close` or `leave`, submit and end no request, and enter and interrupt no body.
+        Notices are still applied."""
         self._may_end.clear()
         self.store.resumed.clear()
         self.store.undecided.clear()
         self.store.reclaimed.clear()
         for arc in [arc for arc in self.store.expected.values() if arc.open]:
-            # It may have to be handed on before it has come once more.
+            # It may have to be handed on before its repeated hand-over.
             self.store.adopt(arc)
             self.store.notify(arc)
 
@@ -150,39 +150,38 @@ class MovableClient:
         return not self.store.resumed.is_set()
 
     async def resumed(self) -> None:
-        """Waits while the client is paused; without end where it leaves like that."""
+        """Wait while the client is paused; forever if it leaves without resuming."""
         await self.store.resumed.wait()
 
     def resume(self) -> None:
-        """Goes on. All that is open is asked again, and what was withheld happens now."""
+        """Continue: submit all open requests again, and do all that was withheld."""
         self._may_end.set()
         self.store.resumed.set()
         for arc in self.store.open:
             self.supervisor.spawn(self.ask_again(arc))
 
     async def ask_again(self, arc: OpenArc) -> None:
-        """An acknowledged request is asked once; what was lost or taken back until there is an answer."""
+        """Submit a request again: once if an RCM has it, until there is an answer if it was lost or taken back."""
         try:
             if arc.state != "asking":
                 await self.rcm.ask(arc)
             await self.rcm.submit(arc)
         except RequestRefused as refused:
-            log.warning("%s is not taken back: %s", arc.name, refused)
+            log.warning("%s was refused when submitted again: %s", arc.name, refused)
             self.store.notify(arc)
             self.store.forget(arc)
 
     def open_requests(self) -> list[OpenRequest]:
-        """What an RCM has answered and is not over: what `hand_over_all` would hand over now."""
+        """Return the requests that an RCM has answered and that are not over, which `hand_over_all` would hand over."""
         now = self.mesh.now()
         return [arc._open_request(now) for arc in self.store.acknowledged]
 
     async def hand_over_all(self, to: Sender) -> None:
-        """Hands all `open_requests` of this paused client to another one, which expects them, in one step. On
-        return that is done, and they go on there.
+        """Hand over all `open_requests` of this paused client, in one step, to the client `to`, which must expect them.
+        On return they continue there.
 
-        Raises RequestRefused where the RCM refuses it; with code `unknown` where none could tell within 10 s: call it
-        again; or see to it that the other client is gone, which an RCM before may have told all the same, and
-        `take_back`."""
+        Raises RequestRefused if the RCM refuses. With code `unknown` the outcome is unknown after 10 s: call it again,
+        or make sure that the other client is gone (an earlier RCM may have notified it) and call `take_back`."""
         if not self.paused:
             raise RuntimeError("pause() the client before it hands over everything: it would ask for it again")
         arcs = sorted(self.store.acknowledged, key=lambda arc: arc.grant is None)
@@ -200,7 +199,7 @@ class MovableClient:
             raise RequestRefused(Problem("unknown", unknown)) from None
 
     async def _hand_over(self, arcs: list[OpenArc], to: Sender) -> None:
-        """Asks until all of `arcs` have moved or are over. Raises RequestRefused."""
+        """Repeat the hand-over until all of `arcs` have moved or are over. Raises RequestRefused."""
         term = self.rcm.term
         pause, longest = FIRST_PAUSE, BACKOFF[1]
         known_by = self.mesh.now() + round(TOKEN_GRACE * SECOND)
@@ -211,39 +210,41 @@ class MovableClient:
             reply = await self.rcm.query(operation)
             notice, problem = (reply.message, reply.problem) if reply is not None else (None, None)
             awaited = await self._awaited_by(to) if notice is not None else set()
-            # Who was promised to meanwhile has been told that they are here.
+            # A candidate that got a promise meanwhile has a report that the requests are here: `accept` drops answers
+            # of lower terms.
             if notice is not None and self.rcm.accept(notice.term):
-                # An RCM that came in between answers for the first alone: it may not know of the others.
-                told = arcs if notice.term == term else [first]
+                # A leader elected since the start answers for the first request alone: it may not know the others.
+                answered = arcs if notice.term == term else [first]
                 if notice.state == "ended":
                     awaited.discard(first.id)
-                moved = [arc for arc in told if arc.open and arc.id not in awaited]
+                moved = [arc for arc in answered if arc.open and arc.id not in awaited]
                 for arc in moved:
                     self.store.move(arc, notice)
                 if moved:
                     continue
             elif notice is not None or (problem is not None and problem.code == "not_running"):
-                # It is over, or an RCM that has just taken the lead does not know it: this settles which. And one of a
-                # lower term than was promised hears of that.
+                # Either it is over, or a new leader does not know it yet: this query settles that. It also informs an
+                # RCM whose term is below the promise.
                 await self.rcm.ask(first)
             elif problem is not None and problem.code == "unknown_client" and self.mesh.now() < known_by:
-                # It sees the RCM; the RCM may not have seen its token yet.
+                # The new client sees the RCM; the RCM may not have seen its token yet.
                 pause = BACKOFF[0]
             elif problem is not None and problem.code not in TRY_AGAIN:
                 raise RequestRefused(problem)
             pause = FIRST_PAUSE if await self.rcm.leader_within(pause) else min(longest, pause * 2)
 
     async def _awaited_by(self, to: Sender) -> set[str]:
-        """Ids of what `to` expects and has had no notice of. Where it does not answer, the RCM's word has to do."""
+        """Return the ids of the requests that `to` expects without a notice yet; none, trusting the RCM, if `to` does
+        not answer."""
         reply = await self.mesh.ask_one(self.mesh.keys.requests(to), RcAsk(), ClientRequests, timeout=QUERY_TIMEOUT)
         requests = reply.message.requests if reply is not None and reply.message is not None else []
         return {request.id for request in requests if request.place is None}
 
     def take_back(self) -> None:
-        """The client to which all was handed is gone: this one goes on, and asks anew for each, at its place.
+        """Continue with all requests after the client that received them is gone: submit each again, at its place.
 
-        Bodies are interrupted as by any other lost hold. What was not handed over after all, where that was
-        unknown, simply stays."""
+        Bodies are interrupted as for any other lost hold. If a hand-over of unknown outcome did not happen, its
+        requests stay unchanged."""
         for arc in list(self.store.moved.values()):
             self.store.reclaim(arc)
         self.store.reclaimed, self.store.undecided = self.store.undecided, set()

@@ -1,4 +1,4 @@
-"""Who this program is, as people are told: user, host and command. Nobody relies on it."""
+"""Identity of this program for people: user, host and command. It grants no rights."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ _MAIN = ("__main__", "__init__")
 
 
 def this_program(host: str) -> Who:
-    """Who runs this process on `host`, and its program's name, without arguments: these may hold secrets."""
+    """Return the user, `host` and name of this program, without arguments, which may contain secrets."""
     return Who(bounded(_user()), bounded(host), bounded(_program()))
 
 
 def host_of(fleet: Fleet) -> str:
-    """The host in the keys of this program: the name in its certificate, a machine's or a person's; on a plain mesh
-    $ZSCOUT_HOST, else this machine's name. Raises BadInput."""
+    """Return the host in this program's keys: the name in its certificate, of a machine or a person; without
+    certificates $ZSCOUT_HOST, else this machine's name. Raises BadInput."""
     if fleet.security is not None:
         return read_certificates(fleet.security).name
     return os.environ.get("ZSCOUT_HOST") or this_machine()
@@ -35,13 +35,13 @@ def this_machine() -> str:
 
 
 def bounded(text: str, most: int = MAX_WHO) -> str:
-    """On one line and not too long for the mesh; what is cut off is replaced by a `…`."""
+    """Return a text on one line, cut to `most` characters, with a `…` for the rest."""
     text = " ".join(clean(text).split())
     return text if len(text) <= most else text[: most - 1].rstrip() + "…"
 
 
 def checked_comment(text: str) -> str:
-    """A comment as it is sent. Raises ValueError where it is too long."""
+    """Return a comment on one line. Raises ValueError if it is longer than MAX_COMMENT."""
     text = " ".join(clean(text).split())
     if len(text) > MAX_COMMENT:
         raise ValueError(f"the comment has {len(text)} characters; write at most {MAX_COMMENT}")

@@ -1,12 +1,11 @@
-"""Blocking code in the main thread is interrupted, by a signal: so a plain script's body ends with its hold.
+"""Interruption of blocking code in the main thread by a signal, so that the body of a plain script ends with its hold.
 
-An exception can be raised in a thread that blocks (in `time.sleep`, a read, a lock) only by a signal's handler, and
-only the main thread runs those. The signal is SIGURG: it is ignored by default, so that one that comes late does no
-harm, and hardly anybody uses it. The handler is there only while some body is, and the one before gets what is not for
-us.
+In a thread that blocks (in `time.sleep`, a read, a lock), only the handler of a signal can raise an exception, and only
+the main thread runs handlers. The signal is SIGURG, which is rarely used, and ignored by default, so that a late signal
+does no harm. The handler is installed only while there is a body; it passes other signals to the previous handler.
 
-It is raised only while the function of the body is on the stack. A notebook's cell, a generator or a coroutine may have
-returned, or be suspended, while its hold goes on: what runs then is an event loop, which the exception would end.
+The exception is raised only while the body's function is on the stack. A notebook's cell may have returned, or a
+generator or coroutine be suspended, while its hold continues; then the exception would end the event loop that runs.
 """
 
 from __future__ import annotations
@@ -21,31 +20,31 @@ from types import CodeType, FrameType
 from typing import Any, Final, TypeVar
 
 SIGNAL: Final = signal.SIGURG
-AGAIN: Final = 0.1
-"""Seconds until the signal is sent again: one that comes right before a blocking call does not interrupt it."""
-SELDOM: Final = 5.0
-"""Seconds until then, at most, while the function of the body is not on the stack."""
+REPEAT_AFTER: Final = 0.1
+"""Seconds until the signal is repeated: if it arrives right before a blocking call, it does not interrupt that."""
+LONGEST_REPEAT: Final = 5.0
+"""Longest time in seconds until it is repeated, while the body's function is not on the stack."""
 
 F = TypeVar("F", bound=Callable[..., Any])
 
 
 class InterruptibleBody:
-    """A body in the main thread, between `enter` and `leave`. `make_error` gives what is raised in it."""
+    """A body in the main thread, between `enter` and `leave`. `make_error` returns the error to raise in it."""
 
     def __init__(self, make_error: Callable[[], Exception]) -> None:
         self.make_error = make_error
         self.over = False
-        """Whether it is to be interrupted."""
-        self.told = False
-        """Whether it knows."""
+        """True once it must be interrupted."""
+        self.notified = False
+        """True once the body has got the error, or learned of the end in another way."""
         self.waits = False
-        """Whether it waits for just that."""
+        """True while the body itself waits for the end of its hold."""
         self._frame: FrameType | None = None
         self._away = False
-        """Whether its function was not on the stack when the last signal came."""
+        """True if its function was not on the stack at the last signal."""
 
     def enter(self) -> None:
-        """Only in the main thread."""
+        """Begin the body. Only in the main thread."""
         global _previous
         self._frame = _body_of(sys._getframe(1))
         if not _bodies:
@@ -53,21 +52,21 @@ class InterruptibleBody:
         _bodies.append(self)
 
     def leave(self) -> None:
-        """The handler from before is back after the last one."""
-        self.told, self._frame = True, None
+        """End the body; the last one to leave restores the previous handler."""
+        self.notified, self._frame = True, None
         if self in _bodies:
             _bodies.remove(self)
             if not _bodies:
-                # None: one that was not set by Python, and can't be set again by it.
+                # None: the handler was not set by Python, which can't restore it.
                 signal.signal(SIGNAL, signal.SIG_DFL if _previous is None else _previous)
 
     async def interrupt(self) -> None:
-        """Raises the error in the main thread: returns when it knows. Runs in any other thread."""
-        self.over, pause = True, AGAIN
-        while not self.told:
+        """Raise the error in the main thread; return once the body knows. Call it in any other thread."""
+        self.over, pause = True, REPEAT_AFTER
+        while not self.notified:
             signal.pthread_kill(_main_thread(), SIGNAL)
             await asyncio.sleep(pause)
-            pause = min(2 * pause, SELDOM) if self._away else AGAIN
+            pause = min(2 * pause, LONGEST_REPEAT) if self._away else REPEAT_AFTER
 
     def is_on(self, frames: list[FrameType]) -> bool:
         """Return True if its function is on this stack."""
@@ -76,12 +75,12 @@ class InterruptibleBody:
 
 
 def interruptible() -> bool:
-    """Whether code of this thread can be interrupted."""
+    """Return True if code in this thread can be interrupted."""
     return threading.current_thread() is threading.main_thread()
 
 
 def uninterrupted(function: F) -> F:
-    """Nothing is raised within `function`; what is due then is raised after it."""
+    """Decorate a function in which nothing may be raised; a due error is raised after it."""
     _quiet.add(function.__code__)
     return function
 
@@ -90,7 +89,7 @@ _bodies: Final[list[InterruptibleBody]] = []
 """Outermost first."""
 _quiet: Final[set[CodeType]] = set()
 _previous: Any = None
-"""What handled the signal before."""
+"""The previous handler."""
 
 
 def _main_thread() -> int:
@@ -105,11 +104,11 @@ def _on_signal(number: int, frame: FrameType | None) -> None:
             _previous(number, frame)
         return
     frames = [*_outwards(frame)]
-    if any(one.f_code in _quiet for one in frames):
+    if any(outer.f_code in _quiet for outer in frames):
         return
-    due = (body for body in _bodies if body.over and not body.told and not body.waits)
+    due = (body for body in _bodies if body.over and not body.notified and not body.waits)
     if (body := next((body for body in due if body.is_on(frames)), None)) is not None:
-        body.told = True
+        body.notified = True
         raise body.make_error()
 
 
@@ -120,14 +119,14 @@ def _outwards(frame: FrameType | None) -> Iterator[FrameType]:
 
 
 def _body_of(frame: FrameType) -> FrameType | None:
-    """The function whose body a `with` that is entered from `frame` has. A generator with `@contextmanager` is
-    suspended meanwhile: it is the function that uses that."""
+    """Return the frame of the function that contains the body of a `with` entered from `frame`. A generator with
+    `@contextmanager` is suspended during the body, so it is skipped for its user."""
     frames = [*_outwards(frame)]
-    for one, caller in zip(frames, [*frames[1:], None], strict=True):
-        if _module(one).startswith(("contextlib", __package__)):
+    for use, caller in zip(frames, [*frames[1:], None], strict=True):
+        if _module(use).startswith(("contextlib", __package__)):
             continue
-        if not (one.f_code.co_flags & inspect.CO_GENERATOR and caller is not None and _module(caller) == "contextlib"):
-            return one
+        if not (use.f_code.co_flags & inspect.CO_GENERATOR and caller is not None and _module(caller) == "contextlib"):
+            return use
     return None
 
 

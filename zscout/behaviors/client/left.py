@@ -1,8 +1,8 @@
-"""Tells the RCs of a direct hold that its program is gone, where its client is gone too, or frozen.
+"""Report to the RCs of a direct hold that its program has ended, in place of a client that is gone or frozen.
 
     python -m zscout.behaviors.client.left
 
-A command's guardian becomes this program once nothing of the command is left. Which hold it was stands in the command's
+The guardian of a command executes this program once the whole command has ended. It takes the hold from the command's
 environment."""
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import msgspec
 from msgspec.structs import replace
 
 from zscout.behaviors.client.confirmation import CONFIRM_AGAIN
-from zscout.behaviors.client.direct import DEFAULT_SETTLE, TELL_TIMEOUT, TRY_AGAIN_AFTER
+from zscout.behaviors.client.direct import DEFAULT_SETTLE, REPORT_TIMEOUT, TRY_AGAIN_AFTER
 from zscout.config.fleet import beside, fleet_from_env
 from zscout.config.strict import BadInput
 from zscout.keyexpr import BadName, check_rc, client_of
@@ -25,17 +25,17 @@ from zscout.messages import Command, Done
 from zscout.types import SECOND, Grant
 
 
-async def tell(mesh: Mesh, rcs: list[str], grant: Grant, patience: float) -> None:
-    """Says `left` to each of them until it has answered, or `patience` seconds are over: then it has settled anyway."""
+async def report_left(mesh: Mesh, rcs: list[str], grant: Grant, patience: float) -> None:
+    """Send `left` to each RC until it has answered, at most for `patience` seconds: then it has settled anyway."""
     with suppress(TimeoutError):
         async with asyncio.timeout(patience):
-            await asyncio.gather(*(_tell(mesh, rc, grant) for rc in rcs))
+            await asyncio.gather(*(_report(mesh, rc, grant) for rc in rcs))
 
 
-async def _tell(mesh: Mesh, rc: str, grant: Grant) -> None:
+async def _report(mesh: Mesh, rc: str, grant: Grant) -> None:
     left = Command(grant=grant, do={"name": "left"}, ttl=1.0)
     while True:
-        reply = await mesh.ask_one(mesh.keys.command(rc, mesh.me), left, Done, timeout=TELL_TIMEOUT)
+        reply = await mesh.ask_one(mesh.keys.command(rc, mesh.me), left, Done, timeout=REPORT_TIMEOUT)
         if reply is not None and (reply.problem is None or reply.problem.code not in CONFIRM_AGAIN):
             return
         await asyncio.sleep(TRY_AGAIN_AFTER)
@@ -47,11 +47,11 @@ async def _main(env: Mapping[str, str]) -> None:
     grant = msgspec.json.decode(env["ZSCOUT_GRANT"], type=Grant)
     mesh = await ZenohMesh.open(replace(fleet, mesh=beside(fleet.mesh)), me)
     try:
-        await tell(mesh, rcs, grant, (fleet.timing.hold_lease + DEFAULT_SETTLE) / SECOND)
+        await report_left(mesh, rcs, grant, (fleet.timing.hold_lease + DEFAULT_SETTLE) / SECOND)
     finally:
         await mesh.close()
 
 
 if __name__ == "__main__":
-    with suppress(BadInput, BadName, KeyError, MeshError, msgspec.DecodeError):  # then they settle for their time
+    with suppress(BadInput, BadName, KeyError, MeshError, msgspec.DecodeError):  # the RCs settle anyway
         asyncio.run(_main(os.environ))

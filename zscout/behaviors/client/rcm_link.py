@@ -1,7 +1,7 @@
-"""A client's link to the RCM: who leads, in which term, and the client's requests on their way there.
+"""A client's link to the RCM: follows leaders and their terms, and submits the client's requests.
 
-A request is sent until an RCM answers, and again every few seconds; without any publication of an RCM for the
-hold lease, holds end here as they do at their RCs.
+A request is sent until an RCM answers, and again every few seconds. If no RCM publishes for the hold lease, holds end
+here, as they do at their RCs.
 """
 
 from __future__ import annotations
@@ -38,49 +38,49 @@ log = logging.getLogger(__name__)
 
 QUERY_TIMEOUT = 1.0
 ASK_AGAIN = 5.0
-"""Seconds between two askings of an open request, give or take a fifth."""
+"""Seconds after which an open request is submitted again, give or take a fifth."""
 BACKOFF = (0.05, 1.0)
-"""Seconds before a query without an answer is repeated: first, and at most."""
+"""Seconds before an unanswered query is repeated: first and longest."""
 END_TRIES = 3
 TRY_AGAIN = frozenset({"busy", "not_leading", "internal", "queue_full", "old_term"})
 DEPOSED = frozenset({"not_leading", "old_term"})
-"""What an RCM says that has been replaced."""
+"""Problem codes from an RCM that has been replaced."""
 CHECKS_PER_LEASE = 10
-"""How often within a hold lease a client checks whether an RCM published."""
+"""Checks for publications of an RCM per hold lease."""
 LEADERLESS: Final = 5.0
-"""Seconds: longer than an election takes."""
+"""Seconds within which an election ends."""
 
 
 class _TermOnly(msgspec.Struct, frozen=True):
-    """What a client reads of the RCM's publications."""
+    """The part of an RCM's publications that a client reads."""
 
     term: Term
 
 
 class RcmLink:
-    """Follows the RCM for one client, answers it when it takes the lead, and sends it what is requested
-    and withdrawn."""
+    """Follows the RCM for one client, reports the client's requests to new leaders, and submits and withdraws
+    requests."""
 
     def __init__(self, mesh: Mesh, fleet: Fleet, store: RequestStore, supervisor: Supervisor) -> None:
         self.mesh, self.fleet, self.store, self._supervisor = mesh, fleet, store, supervisor
         self.key = mesh.keys.schedule(mesh.me)
         self.term: Term = NO_TERM
-        """The highest term received or promised; what is of an older one is ignored."""
+        """The highest term received or promised; messages of lower terms are ignored."""
         self._heard: Term = NO_TERM
-        """The highest term received from a leader: a promise alone is no word of one."""
+        """The highest term received from a leader, without promises to candidates."""
         self._lower: tuple[Term, Ns] = NO_TERM, 0
         """A lower term in which a leader publishes, and since when."""
         self._unanswered = False
-        """Whether the last question had no answer, or none that counts."""
+        """True if the last query had no answer of a current RCM."""
         self._is_ahead = False
-        """Whether the last answer was of a lower term: its RCM is told."""
+        """True if the last answer was of a lower term: the next query then informs its RCM of the higher one."""
         self.leader_came = asyncio.Event()
         self._leaders: set[Token] = set()
         self._changes = 0
-        """How often one came, or one of several went."""
+        """How often a leader appeared, or one of several disappeared."""
         self._last_contact: Ns = mesh.now()
         self._stall = StallWatch(mesh.now)
-        self._last_terms = LastTerms(mesh, supervisor, self._learn, timeout=QUERY_TIMEOUT)
+        self._last_terms = LastTerms(mesh, supervisor, self._raise_term, timeout=QUERY_TIMEOUT)
 
     def start(self) -> list[Declaration]:
         keys, mesh = self.mesh.keys, self.mesh
@@ -92,19 +92,19 @@ class RcmLink:
             Declaration(self._stall.start().stop),
         ]
 
-    # Who leads
+    # The leader
 
     @property
     def leader(self) -> str | None:
-        """The host whose node leads, or None where no RCM is seen."""
+        """The host of the leading node; None if no RCM is visible."""
         return next((token.host for token in sorted(self._leaders)), None)
 
     def accept(self, term: Term, *, promise: bool = False, above: bool = False) -> bool:
-        """Whether what is of `term` counts; the highest term is kept. `promise`: it is a candidate's. `above`: the
-        fleet must go above one that an RC obeys already."""
+        """Return True if messages of `term` count, and keep the highest term. `promise`: the term is a candidate's.
+        `above`: accept even an absurdly high term, as an RC already obeys one."""
         if term < self.term and not promise and self._only_promised(term):
             self._go_back(term)
-        if term < self.term or absurd(term, self.term, heard=self._hears and not above):
+        if term < self.term or absurd(term, self.term, heard=self._in_contact and not above):
             self._last_terms.shown(term, self.term)
             return False
         self.term = term
@@ -113,16 +113,16 @@ class RcmLink:
         return True
 
     def _only_promised(self, term: Term) -> bool:
-        """Return True if a leader of `term` is seen, and the highest term is but a promise to a candidate."""
+        """Return True if a leader of `term` is visible and the highest term is only a promise to a candidate."""
         newer = self._heard < term and self._heard < self.term
         return self.mesh.keys.closed and newer and any(token.instance == term.rcm for token in self._leaders)
 
     async def _follow_lower(self, terms: list[Term]) -> None:
-        """Go back to the leader that is seen, where nothing of the highest term was received for the hold lease, and
-        RCs obey it. Without certificates any word moves the fleet above instead."""
+        """Return to a visible leader of a lower term that RCs obey, if no message of the highest term arrived for the
+        hold lease. Only with certificates: without them the fleet moves above the highest term instead."""
         now, lease = self.mesh.now(), self.fleet.timing.hold_lease
         term = max(terms, default=NO_TERM)
-        if not self.mesh.keys.closed or self._hears or term >= self.term:
+        if not self.mesh.keys.closed or self._in_contact or term >= self.term:
             self._lower = NO_TERM, now
         elif term > NO_TERM:
             if term != self._lower[0]:
@@ -145,29 +145,29 @@ class RcmLink:
         self._changes += 1
         self.leader_came.set()
 
-    def _learn(self, term: Term) -> None:
+    def _raise_term(self, term: Term) -> None:
         self.term = max(self.term, term)
 
     @property
-    def stood_still(self) -> bool:
-        """Whether this process did, so lately that answers which came meanwhile may have been overlooked."""
+    def stalled(self) -> bool:
+        """True just after a stall of this process, in which it may have missed answers."""
         return self._stall.fresh()
 
     @property
-    def _hears(self) -> bool:
+    def _in_contact(self) -> bool:
         return self.mesh.now() - self._last_contact < self.fleet.timing.hold_lease
 
     @property
-    def _heard_lately(self) -> bool:
+    def _contact_is_fresh(self) -> bool:
         return self.mesh.now() - self._last_contact < self.fleet.timing.hold_lease // 2
 
     @property
     def who(self) -> str:
-        """Whom this asks, for people."""
+        """The leader, in words for people."""
         return "the leader" if self.leader is None else f"the leader at {self.leader}"
 
     async def leader_within(self, seconds: float) -> bool:
-        """Waits so long for a leader to appear since `leader_came` was cleared. False: none did."""
+        """Wait for a leader to appear after `leader_came` was cleared; return False if none has within `seconds`."""
         return await done_within(seconds, self.leader_came.wait())
 
     def _on_requests(self, request: IncomingQuery[RcAsk]) -> None:
@@ -194,25 +194,25 @@ class RcmLink:
         (self._leaders.add if alive else self._leaders.discard)(token)
         if self._leaders:
             self._changes += 1
-            # Also where one of two has gone: the answer of the other may have come second, and was not read.
+            # Also if one of two has gone: the answer of the remaining leader may have arrived second, and be lost.
             self.leader_came.set()
 
     async def watch_lease(self) -> NoReturn:
-        """Ends holds when no RCM published for the hold lease: their RCs have ended them as well."""
+        """End holds when no RCM has published for the hold lease, as their RCs do."""
         lease, suspect = self.fleet.timing.hold_lease, self.mesh.suspicions.suspect
         while True:
             await asyncio.sleep(lease / SECOND / CHECKS_PER_LEASE)
             now = self.mesh.now()
-            # As at the RCs: an RCM that was replaced, or whose term is absurd, keeps no hold alive.
-            published = [one.term for _, one in self._published.each()]
+            # As at the RCs, an RCM that was replaced, or has an absurd term, keeps no hold alive.
+            published = [publication.term for _, publication in self._published.each()]
             await self._follow_lower(published)
             if [term for term in published if self.accept(term)]:
-                # It may have published right after the last check.
+                # The RCM may have published right after the last check.
                 self._last_contact = now - lease // CHECKS_PER_LEASE
-            seen = self.leader is not None and not self.stood_still
+            seen = self.leader is not None and not self.stalled
             silent = now - self._last_contact >= lease // 2
             suspect("an RCM is seen that does not publish", so=seen and silent, patience=UNHEARD)
-            if now - self._last_contact < lease or self.stood_still:
+            if now - self._last_contact < lease or self.stalled:
                 continue
             for arc in self.store.open:
                 if arc.state == "running":
@@ -222,24 +222,24 @@ class RcmLink:
     # Requests
 
     async def query(self, operation: Operation) -> Reply[Notice] | None:
-        """An RCM's answer to an operation, of several that which counts; None: none came, and it was carried out or
-        not."""
-        replies = await self.mesh.ask(self.key, operation, Notice, timeout=QUERY_TIMEOUT, enough=self._counts)
-        if not replies or not self._heard_lately or self.mesh.suspicions.any:
+        """Send an operation; return the answer, preferably of a current RCM. None: no answer came, and the operation
+        may have been carried out."""
+        replies = await self.mesh.ask(self.key, operation, Notice, timeout=QUERY_TIMEOUT, enough=self._is_current)
+        if not replies or not self._contact_is_fresh or self.mesh.suspicions.any:
             await self._look_for_contradictions(silent=not replies)
-        reply = max(replies, key=self._counts, default=None)
+        reply = max(replies, key=self._is_current, default=None)
         return reply if reply is None or reply.problem is None else naming_versions(reply, self.who)
 
-    def _counts(self, reply: Reply[Notice]) -> bool:
-        """Whether it is not the word of an RCM that has been replaced."""
+    def _is_current(self, reply: Reply[Notice]) -> bool:
+        """Return True unless the reply is from an RCM that has been replaced."""
         if reply.message is not None:
             return reply.message.term >= self.term
         return reply.problem is None or reply.problem.code not in DEPOSED
 
     async def _look_for_contradictions(self, *, silent: bool) -> None:
-        """An RCM that is seen or heard answers, and one that answers is heard; where candidates are seen one leads
-        before long."""
-        heard = self._heard_lately
+        """Suspect the mesh session if the leader's token, its publications and its answers contradict each other, or if
+        candidates are visible and none leads for long."""
+        heard = self._contact_is_fresh
         there, suspect = self.leader is not None or heard, self.mesh.suspicions.suspect
         suspect("an RCM is seen that does not answer", so=silent and there)
         suspect("an RCM answers that does not publish", so=not silent and not heard)
@@ -248,9 +248,9 @@ class RcmLink:
         suspect("candidates are seen, and no RCM", so=bool(missed), patience=LEADERLESS)
 
     async def submit(self, arc: OpenArc) -> None:
-        """Asks until the RCM has answered; not while the client is paused. Raises RequestRefused."""
+        """Submit a request until an RCM has answered; wait while the client is paused. Raises RequestRefused."""
         if self.mesh.keys.closed and (why := self.fleet.access.refusal(self.mesh.me.host, "request devices", USERS)):
-            # Access control lets no such question through: nobody would answer it.
+            # Access control drops such queries: there would be no answer.
             arc.state = "refused"
             raise RequestRefused(Problem("not_allowed", why))
         pause, longest = BACKOFF
@@ -272,12 +272,12 @@ class RcmLink:
                 pause = min(longest, pause * 2)
 
     async def ask(self, arc: OpenArc, *, reachable: bool = False) -> Problem | None:
-        """Asks once, and applies the answer. Returns why it was refused, if it was."""
+        """Submit a request once, and apply the answer. Return the problem if it was refused."""
         ask = arc._ask(self.mesh.now(), reachable=reachable)
-        # To an RCM that has been replaced and does not know it, a later one's place is one that can't be.
+        # With `term`, an RCM that was replaced learns so; it would refuse a place of a later RCM as impossible.
         ahead = self._is_ahead or arc._place is not None
         reply = await self.query(msgspec.structs.replace(ask, term=self.term) if ahead else ask)
-        # One that has been replaced and does not know it has not answered for the one that counts.
+        # An answer of a replaced RCM doesn't count.
         self._unanswered = reply is None or (reply.message is not None and reply.message.term < self.term)
         if reply is None:
             return None
@@ -290,8 +290,8 @@ class RcmLink:
         return reply.problem
 
     async def keep_asking(self) -> NoReturn:
-        """Asks for all that is open again, and withdraws what was given up, at every change of RCM and every
-        few seconds; sooner where the RCM did not answer."""
+        """Submit all open requests again, and withdraw those given up, at every change of the RCM and every few
+        seconds; sooner if the RCM did not answer."""
         unanswered, known = False, self._changes
         while True:
             if self._changes == known:
@@ -304,7 +304,7 @@ class RcmLink:
                     problem = await self.ask(arc)
                     unanswered |= self._unanswered
                     if problem is not None and problem.code not in TRY_AGAIN and arc.state == "queued":
-                        # It will be refused each time, though an earlier RCM took it.
+                        # It would be refused each time, though an earlier RCM accepted it.
                         self.store.withdrawn[arc.id] = Cancel(id=arc.id)
                         arc._finish("lost", f"the leader refuses it: {problem.message}", self.mesh.now())
                         self.store.notify(arc)
@@ -315,10 +315,10 @@ class RcmLink:
                     break
 
     async def end(self, arc: OpenArc) -> None:
-        """Gives back a hold, or leaves the queue: returns when that was answered, or was tried a few times.
-        `keep_asking` goes on with it then."""
+        """Give back a hold, or leave the queue. Return when an RCM has answered, or after a few tries, which
+        `keep_asking` continues."""
         running = arc.state == "running"
-        # What its program touched it has left.
+        # `left`: its program has left the devices.
         self.store.withdrawn[arc.id] = (Release if running else Cancel)(id=arc.id, left=True)
         arc._finish("released" if running else "cancelled", "given up by this client", self.mesh.now())
         self.store.notify(arc)
@@ -328,12 +328,12 @@ class RcmLink:
         self.store.forget(arc)
 
     async def give_back(self, operation: Release | Cancel) -> None:
-        """Withdraws what nobody here asks for any more."""
+        """Withdraw a request that this client does not have any more."""
         self.store.withdrawn[operation.id] = operation
         await self._withdraw(operation.id)
 
     async def _withdraw(self, request_id: str) -> bool:
-        """Sends once what is to be withdrawn; whether that was answered."""
+        """Send a pending withdrawal once; return True if none is pending any more."""
         if (operation := self.store.withdrawn.get(request_id)) is None:
             return True
         reply = await self.query(operation)

@@ -1,4 +1,4 @@
-"""A client's requests: what was asked for, and the state of each by the newest notice. Time is passed in."""
+"""A client's requests, and the state of each by its newest notice. Time is passed in."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Needs = Mapping[str, Mapping[str, Any]]
 
 
 HINT = ("add --wait-for-device", "pass wait_for_device=True")
-"""What a leader proposes to people, and what a program writes."""
+"""The option in a leader's message, and the argument that replaces it in errors for programs."""
 
 
 class RequestRefused(Exception):
@@ -49,7 +49,7 @@ class CommandRefused(Exception):
 
 
 class HoldEnd(NamedTuple):
-    """How a hold ended: the protocol's outcome, the reason in words, and the ARC that it was taken for."""
+    """How a hold ended: the protocol's outcome, the reason for people, and the name of the request that took it."""
 
     outcome: str
     reason: str
@@ -62,8 +62,8 @@ class OpenArc:
     change it. Times are in ns on this host's clock.
 
     `state` is `asking` until the leader has answered, then `queued`, `running`, `ended` or `refused`. A request that
-    another client hands over is `expected` first, and `awaited` where a later leader still counts it as that client's;
-    one that was handed over to another client is `moved`.
+    another client hands over is `expected` first, and `awaited` if a later leader still counts it as that client's. A
+    request that was handed over to another client is `moved`.
     """
 
     id: str
@@ -74,79 +74,81 @@ class OpenArc:
     min_runtime: Decimal
     """Seconds for which a hold is protected."""
     keep: bool = False
-    """Whether a hold continues after that until another request waits."""
+    """True if the hold then continues until another request waits."""
     estimate: bool = False
-    """Whether the RCM is asked to estimate when it will start."""
+    """True to request estimates of its start from the RCM."""
     direct: bool = False
-    """Whether its program touches devices past their RCs (`direct.py`)."""
+    """True if its program also reaches devices past zscout (`direct.py`)."""
     continues: str = ""
-    """The name of another ARC of its client's, from which it goes on."""
+    """Name of this client's request whose hold it replaces."""
     who: Who | None = None
-    """Who asks, as others are told."""
+    """User, host and command of the request, shown to other people."""
     booking: str = ""
     """The booking that it takes up: its id; once the leader has answered, with its date: `<id>@<start>`."""
     _check: bool = False
-    """Whether it is to be refused at once if it can never start."""
+    """True to be refused at once if it can never start."""
     _wait_for_device: bool = False
-    """Whether it waits for an RC that nobody knows all the same."""
+    """True to wait for an unknown RC instead of being refused."""
     state: str = "asking"
     reason: str = ""
-    """Why it is in this state, in words."""
+    """Why it is in this state, for people."""
     why: ReasonInfo | None = None
-    """What `reason` says, as data, where the RCM gave that."""
+    """`reason` in structured form, if the RCM sent it."""
     outcome: str | None = None
     """How its last hold, or the request, ended: an outcome of the protocol, such as `preempted`."""
     by: str | None = None
     """The name of the request that took its devices."""
     _place: Place | None = None
     _seal: str | None = None
-    """Proof that the place is its own, by the RCM's word."""
+    """The RCM's proof that the place belongs to this request."""
     _was: str | None = None
-    """The id under which it had that place, if that was another one."""
+    """Former id, if `_place` was given under another id."""
     ahead: int | None = None
     """While it is queued: how many requests are before it."""
     start: Ns | None = None
-    """While it is queued: when it will start by the leader's last estimate."""
+    """While it is queued: its start by the leader's last estimate."""
     grant: Grant | None = None
-    """While it runs: the grant, which commands show."""
+    """While it runs: the grant, which each command carries."""
     rcs: list[str] = field(default_factory=list)
     """The devices that it holds, or held last."""
     bound: dict[str, str] = field(default_factory=dict)
     """For each pattern, the device among them that satisfies it."""
     hosts: dict[str, str] = field(default_factory=dict)
-    """The host of each device, as far as the leader names it."""
+    """The host of each device, if the leader has named it."""
     end: Ns = 0
-    """When the minimum runtime of the present hold is over, at the latest."""
+    """Latest end of the present hold's minimum runtime."""
     ready: Ns | None = None
-    """While devices of the present hold are starting: when they are ready, at the latest. Its runtime begins then."""
+    """While devices of the present hold are starting: the latest time by which they are ready. Its runtime begins
+    then."""
     upcoming: list[HoldNotice] = field(default_factory=list)
     """While it runs: the request, and the booking or maintenance, to which the hold yields next."""
     since: Ns = 0
     """When `state` began."""
     _waits_since: Ns | None = None
-    """When it was last queued: its present wait began then, whichever RCM leads."""
+    """Begin of its present wait, under any RCM."""
     _unconfirmed: tuple[Grant, list[str]] | None = None
-    """The grant that some of its RCs did not confirm, and which, until the RCM has answered that."""
+    """A grant and those of its RCs that did not confirm it, until the RCM has answered that report."""
     _settling: Grant | None = None
-    """The grant whose RCs have not all stopped settling."""
+    """A grant of which some RCs are still settling."""
     _left: Grant | None = None
-    """The last grant whose program was told to leave: it is not entered again."""
+    """The last grant whose program was asked to leave: no body enters it again."""
     _unserved: Grant | None = None
-    """The grant whose time went by so, until the RCM has answered that."""
+    """A grant whose time passed while RCs were settling, until the RCM has answered that report."""
     _ending: HoldEnd | None = None
-    """How the last hold ended; `outcome` and `reason` are of the newest notice, whatever it is about."""
-    _shown: Term = NO_TERM
-    """In which term its place was shown last, to an RCM that had given a worse one."""
+    """How the last hold ended; `outcome` and `reason` are those of the newest notice of any kind."""
+    _place_shown_in: Term = NO_TERM
+    """Term in which the client last showed its place to an RCM that had assigned a worse one."""
     _last: tuple[Term, int] = field(default=(NO_TERM, 0))
-    _told: Ns = 0
-    """When the newest notice came."""
-    _came: Term | None = field(default=None, init=False, repr=False)
-    """In which term another client handed it over, until an RCM of a later one says whose it is."""
-    _news: asyncio.Event = field(default_factory=asyncio.Event, init=False, compare=False, repr=False)
+    """Term and step of the newest notice."""
+    _notified_at: Ns = 0
+    """Time of the newest notice."""
+    _moved_in: Term | None = field(default=None, init=False, repr=False)
+    """Term in which another client handed it over, until an RCM of a later term confirms that."""
+    _change: asyncio.Event = field(default_factory=asyncio.Event, init=False, compare=False, repr=False)
 
     @classmethod
     def _expected(cls, request: OpenRequest, now: Ns) -> Self:
-        """What another client will hand over. Raises BadName."""
+        """Return a request that another client will hand over. Raises BadName."""
         for need in request.needs:
             check_need(need)
         id_, name = check_name(request.id, "id"), check_name(request.arc, "arc")
@@ -158,7 +160,7 @@ class OpenArc:
         return arc
 
     def _is_over(self, now: Ns) -> bool:
-        """Whether the time of the present hold is over by this host's clock."""
+        """Return True if the time of the present hold is over by this host's clock."""
         return not self.keep and self.ready is None and now >= self.end
 
     @property
@@ -167,17 +169,17 @@ class OpenArc:
         return self.state in ("asking", "queued", "running", "awaited")
 
     def _take(self, notice: Notice, now: Ns) -> bool:
-        """Applies a newer notice of this request. False if it is an old one, a replaced RCM's, or reports a
-        hold that is not what was asked for."""
+        """Apply a notice of this request. Return False, with nothing changed, if it is outdated or reports a hold of
+        other devices than requested."""
         if (notice.term, notice.step) <= self._last or not self.open:
             return False
         if (bound := self._binding(notice)) is None:
             return False
         self._last, self._unconfirmed, self._unserved = (notice.term, notice.step), None, None
-        self._told = now
+        self._notified_at = now
         self.booking = notice.booking or self.booking
-        if self._came is not None and self._came < notice.term:
-            self._came = None
+        if self._moved_in is not None and self._moved_in < notice.term:
+            self._moved_in = None
         if notice.state != self.state or notice.grant != self.grant:
             self.since = now
         if notice.state != "running":
@@ -201,8 +203,8 @@ class OpenArc:
         return True
 
     def _binding(self, notice: Notice) -> dict[str, str] | None:
-        """The RC that meets each pattern, each another one; None: this is no binding of what was asked for, or it is of
-        other RCs, as some node has reported it."""
+        """Return by pattern the RC that satisfies it. None if the notice's RCs don't satisfy the needs, as may be after
+        a false report by a node."""
         bound = {need: notice.bound.get(need, "") for need in self.needs if is_pattern(need)}
         if notice.state != "running":
             return {}
@@ -222,60 +224,69 @@ class OpenArc:
             self._waits_since = now
 
     def _lose(self, reason: str, now: Ns) -> None:
-        """The hold is over by the client's own judgement; the request is asked again."""
+        """End the hold by the client's own judgement; the request must be submitted again."""
         self._close(HoldEnd("lost", reason), now)
         self.state, self.reason, self.outcome, self.since = "asking", reason, "lost", now
         self.why = None
 
     def _not_confirmed(self, rcs: list[str], reason: str, now: Ns) -> None:
-        """These RCs do not confirm its grant: it is not entered, and the RCM is to queue it again."""
-        assert self.grant is not None  # noqa: S101 - what is not confirmed was granted
+        """Give up the hold because `rcs` do not confirm its grant; the RCM will queue it again."""
+        assert self.grant is not None  # noqa: S101 - only grants are confirmed
         self._unconfirmed = self.grant, rcs
         self._lose(reason, now)
 
     def _not_served(self, grant: Grant | None, now: Ns) -> None:
-        """The time of this grant went by while RCs of it settled: it is asked for once more, at its place."""
+        """Give up a grant whose time passed while its RCs were settling; the request is submitted again, at its
+        place."""
         self._lose("its time passed while its devices settled", now)
         self._unserved, self._settling = grant, None
 
     def _finish(self, outcome: str, reason: str, now: Ns) -> None:
-        """The request is over by the client's own judgement."""
+        """End the request by the client's own judgement."""
         self._close(HoldEnd(outcome, reason), now)
         self.state, self.outcome, self.reason, self.since = "ended", outcome, reason, now
         self.why = None
 
     def _shows_place(self, notice: Notice) -> bool:
-        """Whether the RCM is to be shown its place, once in a term: it gave a worse one, to a question from before."""
+        """Return True if the client must show its place to the RCM, which has assigned a worse one in answer to an
+        older query; at most once per term."""
         if notice.state != "queued" or notice.place is None or notice.place == self._place:
             return False
-        shown, self._shown = self._shown, notice.term
+        shown, self._place_shown_in = self._place_shown_in, notice.term
         return shown != notice.term
 
     def _reopen(self, now: Ns) -> None:
-        """It ended because this client seemed gone, which lives: it is asked for again, at its place."""
+        """Undo an end with outcome `client_lost`, as this client lives; the request is submitted again, at its
+        place."""
         self.state, self.since, self.why = "asking", now, None
 
     def _take_first(self, notice: Notice, now: Ns) -> bool:
-        """Applies the first notice of an expected request. False if it is none: an old one, or not credible."""
+        """Apply the first notice of an expected request. Return False if it is an end, outdated, or of other
+        devices."""
         before, self.state = self.state, "asking"
         if notice.state != "ended" and self._take(notice, now):
-            self._came = notice.term
+            self._moved_in = notice.term
             return True
         self.state = before
         return False
 
-    def _is_not_here_yet(self, notice: Notice) -> bool:
-        """Whether the notice says that it is another client's still, which had handed it over to this one at an RCM
-        that was replaced: it is to hand it over once more."""
-        return self.open and notice.outcome == "handed_over" and self._came is not None and self._came < notice.term
+    def _must_be_handed_over_again(self, notice: Notice) -> bool:
+        """Return True if, by a later RCM, the request still belongs to the client that handed it over at an earlier
+        RCM; that client must repeat the hand-over."""
+        return (
+            self.open
+            and notice.outcome == "handed_over"
+            and self._moved_in is not None
+            and self._moved_in < notice.term
+        )
 
     def _await_again(self, notice: Notice, now: Ns) -> None:
-        """It is not here yet."""
+        """Await the repeated hand-over."""
         self._lose("its old client is to hand it over once more", now)
-        self.state, self._came, self._last = "awaited", None, (notice.term, notice.step)
+        self.state, self._moved_in, self._last = "awaited", None, (notice.term, notice.step)
 
     def _go_back(self, term: Term) -> None:
-        """Forget what leaders of terms above `term` said: their fleet knows no such term any more."""
+        """Forget all that came from leaders of terms above `term`, which the fleet no longer knows."""
         if self._last[0] > term:
             self._last = NO_TERM, 0
         if self._place is not None and self._place.term > term:
@@ -286,12 +297,12 @@ class OpenArc:
             self._unserved = None
 
     def _move(self, now: Ns) -> None:
-        """It goes on in another client."""
+        """End the hold here; the request continues in another client."""
         self._close(HoldEnd("handed_over", "handed over"), now)
         self.state, self.since = "moved", now
 
     def _take_back(self, new_id: str, reason: str, now: Ns) -> None:
-        """The client to which it was handed over is gone: it is asked for anew, at its old place."""
+        """Prepare a new request, with `new_id`, at the old place."""
         if self._ending is not None and self._ending.outcome == "handed_over":
             self._ending = HoldEnd("lost", reason)
         self.id, self._was, self._last = new_id, self._was or self.id, (NO_TERM, 0)
@@ -299,7 +310,7 @@ class OpenArc:
         self.why = None
 
     def _ask(self, now: Ns, *, reachable: bool = False) -> Ask:
-        """`reachable`: the RCs that did not confirm its last grant have shown themselves anew."""
+        """`reachable`: the tokens of RCs that did not confirm the last grant are back."""
         grant, unconfirmed = self._unconfirmed or (self.grant or self._unserved, [])
         return carried(
             self._as_asked(now, grant),
@@ -313,7 +324,7 @@ class OpenArc:
         )
 
     def _open_request(self, now: Ns) -> OpenRequest:
-        """As it is reported to an RCM that takes the lead."""
+        """Return the request as reported to a new leader."""
         return self._as_asked(now, self.grant)
 
     def _as_asked(self, now: Ns, grant: Grant | None) -> OpenRequest:
@@ -339,7 +350,7 @@ class OpenArc:
 
 
 def amounts(needs: Needs) -> dict[str, Amounts]:
-    """Needs as people write them (ints, floats, Decimals), as they are sent. 0.1 means one tenth. Raises TypeError."""
+    """Convert the numbers in needs (int, float, Decimal) for the mesh; 0.1 means one tenth. Raises TypeError."""
     if not isinstance(needs, Mapping):
         raise TypeError(f'needs is {needs!r}; write {{"robot/scout33": {{}}}}')
     for rc, params in needs.items():
@@ -349,36 +360,38 @@ def amounts(needs: Needs) -> dict[str, Amounts]:
 
 
 def check_seconds(what: str, value: Any) -> None:
-    """Raises ValueError for what is no span of time."""
+    """Raises ValueError unless `value` is a finite number above 0."""
     is_number = isinstance(value, (int, float, Decimal)) and not isinstance(value, bool)
     if not is_number or not math.isfinite(value) or value <= 0:
         raise ValueError(f"{what} is {value!r}; write a number of seconds above 0")
 
 
 class RequestStore:
-    """All that a client has asked for and that is not over, by request id; who waits for news of it; and
-    whether the client is paused."""
+    """A client's requests that are not over, by id; notifies waiters of their changes; and knows if the client is
+    paused."""
 
     def __init__(self, now: Callable[[], Ns], ask_again: Callable[[OpenArc], object]) -> None:
-        """`ask_again` is called with what the RCM dropped because this client seemed gone, or has at a worse place than
-        it had; and with what is `awaited`: it came from another client, and is that one's still by a later RCM."""
+        """`ask_again` is called with each request that must be submitted again: the RCM dropped it because this client
+        seemed gone, or assigned a worse place; or it is `awaited`: by a later RCM it still belongs to the client that
+        handed it over."""
         self._now, self._ask_again = now, ask_again
         self.arcs: dict[str, OpenArc] = {}
         self.moved: dict[str, OpenArc] = {}
-        """What was handed over while this client was paused, and may be taken back."""
+        """Requests handed over while this client was paused, which it may take back."""
         self.expected: dict[str, OpenArc] = {}
-        """What is to be handed to this client, and of which no notice has come yet."""
+        """Requests that another client will hand over, before their first notice."""
         self.withdrawn: dict[str, Release | Cancel] = {}
-        """What this client gave up, until an RCM has answered that."""
+        """Requests that this client gave up, until an RCM has answered that."""
         self.undecided: set[str] = set()
-        """Ids of what was to be handed over, where nobody could tell whether it was."""
+        """Ids of requests whose hand-over has an unknown outcome."""
         self.reclaimed: set[str] = set()
-        """Those of them that are this client's in any case: under a new id if they were handed over."""
+        """Ids of undecided requests that the client has reclaimed: under a new id if they turn out to be handed
+        over."""
         self.resumed = asyncio.Event()
-        """Not set while the client is paused."""
+        """Cleared while the client is paused."""
         self.resumed.set()
         self.watchers: list[Callable[[OpenArc], None]] = []
-        """Each is called with whatever there is news of."""
+        """Each is called with every request that changes."""
 
     @property
     def open(self) -> list[OpenArc]:
@@ -386,21 +399,22 @@ class RequestStore:
 
     @property
     def acknowledged(self) -> list[OpenArc]:
-        """Those that an RCM has answered: queued, running, or asked for again at their place."""
+        """Requests that an RCM has answered: queued, running, or submitted again at their place."""
         return [arc for arc in self.open if arc.state != "asking" or arc._place is not None]
 
     def add(self, arc: OpenArc) -> None:
         self.arcs[arc.id] = arc
 
     def expect(self, arc: OpenArc) -> None:
-        """`arc` is to be handed to this client. If it comes back, notices from before it went are old."""
+        """Expect `arc` from another client. If it was handed over to that client before, earlier notices are
+        outdated."""
         if (before := self.moved.pop(arc.id, None)) is not None:
-            arc._last, arc._news = before._last, before._news
+            arc._last, arc._change = before._last, before._change
         self.withdrawn.pop(arc.id, None)
         self.expected[arc.id] = arc
 
     def adopt(self, arc: OpenArc) -> None:
-        """What was expected is this client's: told so by a notice, or to be asked for."""
+        """Take an expected request as this client's, after its first notice, or to submit it."""
         if self.expected.pop(arc.id, None) is not None:
             if arc.state in ("expected", "awaited"):
                 arc.state = "asking"
@@ -412,30 +426,30 @@ class RequestStore:
         self.expected.pop(arc.id, None)
 
     def notify(self, arc: OpenArc) -> None:
-        """Wakes all who wait for news of `arc`."""
-        arc._news.set()
+        """Wake all tasks that wait for a change of `arc`, and call the watchers."""
+        arc._change.set()
         for watcher in self.watchers:
             watcher(arc)
 
     async def changed(self, arc: OpenArc) -> None:
-        """Waits for the next news; not at all where none is to come."""
+        """Wait for the next change of `arc`; return at once if there can be none."""
         if arc.id in self.arcs or arc.id in self.moved or arc.id in self.expected:
-            arc._news.clear()
-            await arc._news.wait()
+            arc._change.clear()
+            await arc._change.wait()
 
     def take(self, arc: OpenArc, notice: Notice) -> None:
-        """Applies a notice of the RCM about one of `arcs`."""
+        """Apply the RCM's notice of one of `arcs`."""
         if notice.id != arc.id:
-            # An answer that was on its way when the ARC was taken back under another id.
+            # An answer that was under way when the ARC was taken back under another id.
             return
         granted, unserved = arc.grant is not None, {arc._settling, arc._unserved} - {None}
         if notice.outcome == "handed_over" and not self.resumed.is_set():
-            # Not before the hand-over is answered: an RCM that dies first may not have notified the other.
+            # Wait for the answer to the hand-over: an RCM that dies before may not have notified the new client.
             return
         if notice.outcome == "handed_over" and arc.id in self.reclaimed and arc.open:
             self.move(arc, notice)
             self.reclaim(arc)
-        elif arc._is_not_here_yet(notice):
+        elif arc._must_be_handed_over_again(notice):
             arc._await_again(notice, self._now())
             del self.arcs[arc.id]
             self.expected[arc.id] = arc
@@ -450,30 +464,30 @@ class RequestStore:
                 arc._not_served(notice.grant, self._now())
                 self._ask_again(arc)
             elif not granted and arc.outcome == "completed":
-                self._ask_anew(arc)
+                self._submit_under_new_id(arc)
             elif arc._shows_place(notice):
                 self._ask_again(arc)
             self.notify(arc)
             if not arc.open:
                 self.forget(arc)
 
-    def _ask_anew(self, arc: OpenArc) -> None:
-        """Nobody made use of its time: it is asked for under a new id, at its place."""
+    def _submit_under_new_id(self, arc: OpenArc) -> None:
+        """Submit under a new id, at its place, a request whose time was over before this client had its grant."""
         del self.arcs[arc.id]
         arc._take_back(new_instance(), "it had its time before this client heard of it", self._now())
-        arc.booking = ""  # so had that
+        arc.booking = ""  # the booking's time is over too
         self.arcs[arc.id] = arc
         self._ask_again(arc)
 
     def open_requests(self) -> list[OpenRequest]:
-        """All, as it is reported to an RCM that takes the lead. What is expected has no place: it is this
-        client's if the RCs report it so, and nothing is queued for it otherwise."""
+        """Return all requests as reported to a new leader. Expected requests have no place: they belong to this client
+        only if the RCs report them so, and are not queued otherwise."""
         now = self._now()
         expected = [msgspec.structs.replace(arc._open_request(now), place=None) for arc in self.expected.values()]
         return [*(arc._open_request(now) for arc in self.open), *expected]
 
     def move(self, arc: OpenArc, notice: Notice) -> None:
-        """`arc` goes on in another client, as of `notice`; earlier notices are old."""
+        """Mark `arc` as moved to another client, as of `notice`; earlier notices are outdated."""
         arc._move(self._now())
         arc._last = max(arc._last, (notice.term, notice.step))
         self.arcs.pop(arc.id, None)
@@ -481,12 +495,12 @@ class RequestStore:
         self.notify(arc)
 
     def go_back(self, term: Term) -> None:
-        """The client follows the leader of `term` after higher ones."""
+        """Forget all that came from leaders above `term`, to whose leader the client returns."""
         for arc in (*self.arcs.values(), *self.moved.values(), *self.expected.values()):
             arc._go_back(term)
 
     def reclaim(self, arc: OpenArc) -> None:
-        """A moved one is this client's again, under a new id; it is to be asked for."""
+        """Take back a moved request, under a new id; it must be submitted again."""
         del self.moved[arc.id]
         self.reclaimed.discard(arc.id)
         arc._take_back(new_instance(), "it was handed over, and its new client is gone", self._now())
