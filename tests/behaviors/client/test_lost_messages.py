@@ -88,7 +88,7 @@ async def test_a_client_that_hears_no_publication_of_an_rcm_that_it_sees_joins_t
             fleet.network.disturb({"grants": Disturbance(lost=1.0)})
             await until(lambda: one.mesh._transport.id() != before)
             fleet.network.disturb({})
-    said = {record.message.partition(": this process")[0] for record in caplog.records}
+    said = {record.message.partition(": reopening the mesh session")[0] for record in caplog.records}
     assert "an RCM is seen that does not publish" in said
 
 
