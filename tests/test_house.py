@@ -33,7 +33,8 @@ HEADLESS = (
 PLAIN = [
     "zscout/drivers",
     *("zscout/components", "zscout/config", "zscout/placement", "zscout/simulation", "zscout/testing"),
-    *("zscout/mesh", "zscout/messages"),
+    *("zscout/mesh", "zscout/messages", "zscout/services/bookings", "zscout/services/node"),
+    *("zscout/services/metrics", "zscout/services/placement"),
     *("zscout/keyexpr.py", "zscout/logs.py", "zscout/ports.py", "zscout/streams.py", "zscout/terminal.py"),
     *("zscout/trace.py", "zscout/types.py"),
 ]

@@ -94,10 +94,10 @@ async def test_hangup_reads_the_files_again_and_never_ends_the_node(lab: Lab) ->
         await heard.until("READY")
         file = lab.folder / "anvil.toml"
         for old, new, said in (
-            ("max = 3", "max = 4", "SIGHUP: took components.max"),
-            ("max = 4", "max = 0", "the settings of before stay"),
-            ("max = 0", "max = 4", "SIGHUP: the files say what they said"),
-            ("robot/a", "robot/b", "SIGHUP: took rc.robot/a, rc.robot/b"),
+            ("max = 3", "max = 4", "SIGHUP: applied components.max"),
+            ("max = 4", "max = 0", "keeping the previous settings"),
+            ("max = 0", "max = 4", "SIGHUP: nothing changed"),
+            ("robot/a", "robot/b", "SIGHUP: applied rc.robot/a, rc.robot/b"),
         ):
             file.write_text(file.read_text().replace(old, new))
             node.send_signal(signal.SIGHUP)

@@ -164,7 +164,7 @@ def test_reload_goes_on_and_a_bad_file_is_told(machine: Machine) -> None:
     machine.write("/etc/zscout/node.toml", SMALL)
     machine.run("systemctl", "restart", "zscout-node")
     pid = machine.show("zscout-node", "MainPID")
-    for text, said in ((SMALL.replace("3", "0"), "the settings of before stay"), (SMALL, "say what they said")):
+    for text, said in ((SMALL.replace("3", "0"), "keeping the previous settings"), (SMALL, "SIGHUP: nothing changed")):
         machine.write("/etc/zscout/node.toml", text)
         machine.run("systemctl", "reload", "zscout-node")
         machine.until_logged(said)

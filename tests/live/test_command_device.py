@@ -74,4 +74,4 @@ async def test_sighup_starts_new_devices_and_stops_removed_ones_while_others_are
         async with hold(client, "new", {"psu/new": {}}, confirmed=True):
             state = await lab.state(client, lambda state: len(state.holds) == 2)
         assert held.grant in [view.grant for view in state.holds]
-    assert "SIGHUP: took rc.psu/new, rc.psu/old" in lab.log("small")
+    assert "SIGHUP: applied rc.psu/new, rc.psu/old" in lab.log("small")

@@ -103,8 +103,8 @@ class _Request(_Asked, frozen=True):
     direct: bool = False
     """The program accesses devices directly rather than through their RCs, which settle when the hold ends."""
     continues: ContinuedArc = ""
-    """The name of another ARC of the client that this ARC continues: a device that passes from the old ARC to the new one
-    in a single step is not made safe in between. Neither ARC may be direct."""
+    """The name of another ARC of the client that this ARC continues: a device that passes from the old ARC to the new
+    one in a single step is not made safe in between. Neither ARC may be direct."""
     unserved: bool = False
     """The time of `grant` passed while RCs of it settled: it was never used."""
     who: Who | None = None

@@ -115,6 +115,6 @@ def test_of_two_halves_the_one_counts_whose_clocks_are_synchronised() -> None:
 
 def test_one_clock_of_three_that_is_wrong_changes_nothing_much() -> None:
     assert agreed([NOON, NOON + 1, NOON + 3_600 * SECOND]) == NOON + 1
-    assert agreed([NOON, NOON + 10], goes_on=NOON + 9) == NOON + 10
-    assert agreed([NOON, NOON + 10], goes_on=NOON + 1) == NOON
+    assert agreed([NOON, NOON + 10], current=NOON + 9) == NOON + 10
+    assert agreed([NOON, NOON + 10], current=NOON + 1) == NOON
     assert agreed([NOON, NOON + 10]) == NOON

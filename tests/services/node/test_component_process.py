@@ -94,7 +94,7 @@ def test_who_says_what_is_no_message_is_killed(tmp_path: Path) -> None:
 
     process = play(tmp_path, "Garbler", {}, story)
     assert process.ended == "failed"
-    assert "what it sent to its node is no message" in process.reason
+    assert "it sent its node an invalid message" in process.reason
 
 
 def test_who_ends_before_it_has_answered_is_not_waited_for(tmp_path: Path) -> None:

@@ -116,10 +116,10 @@ async def test_a_key_is_taken_at_the_start_and_at_sighup_alike(
     changed.write_text(merged(files[changed], f"{least}\n{key} = {value}"))
     line = await running.now()
     assert running.in_force.fault == ""
-    assert "restart this node to take" in line
+    assert "restart this node to apply" in line
     assert table in line
     started = Reload(lambda: load_node(node))
-    assert await started.now() == "SIGHUP: the files say what they said"
+    assert await started.now() == "SIGHUP: nothing changed"
     assert_readable(started.node)
 
 

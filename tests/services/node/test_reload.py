@@ -57,10 +57,10 @@ def files(tmp_path: Path) -> Files:
 def test_what_somebody_takes_is_given_to_it_once(files: Files) -> None:
     given: list[int] = []
     files.reload.takes(lambda node: given.append(node.components.max), "components")
-    assert files.again(NODE) == "SIGHUP: the files say what they said"
+    assert files.again(NODE) == "SIGHUP: nothing changed"
     new = NODE.replace("max = 3", 'max = 4\nkinds = ["counter"]')
-    assert files.again(new) == "SIGHUP: took components.kinds, components.max"
-    assert files.again(new) == "SIGHUP: the files say what they said"
+    assert files.again(new) == "SIGHUP: applied components.kinds, components.max"
+    assert files.again(new) == "SIGHUP: nothing changed"
     assert given == [4]
 
 
@@ -68,12 +68,12 @@ def test_what_nobody_takes_waits_for_a_restart_and_is_told(files: Files, caplog:
     files.reload.takes(lambda _node: None, "components")
     node = NODE.replace("max = 3", "max = 4").replace("robot/a", "robot/b")
     fleet = FLEET.replace("1.5", "2.0") + 'bellows = ["robot/c"]\n[limits]\nmax_runtime = 60\n'
-    later = "restart this node to take devices.bellows, limits.max_runtime, mesh.lease, rc.robot/a, rc.robot/b"
+    later = "restart this node to apply devices.bellows, limits.max_runtime, mesh.lease, rc.robot/a, rc.robot/b"
     caplog.set_level(logging.INFO)
-    assert files.again(node, fleet) == f"SIGHUP: took components.max; {later}"
+    assert files.again(node, fleet) == f"SIGHUP: applied components.max; {later}"
     assert files.again(node, fleet) == f"SIGHUP: {later}"
     assert [(one.levelname, one.message) for one in caplog.records] == [
-        ("WARNING", f"SIGHUP: took components.max; {later}"),
+        ("WARNING", f"SIGHUP: applied components.max; {later}"),
         ("WARNING", f"SIGHUP: {later}"),
     ]
 
@@ -93,10 +93,10 @@ def test_a_bad_file_changes_nothing_and_is_told(files: Files, spoil: Callable[[s
     line = files.again(spoil(NODE.replace("robot/a", "robot/b")))
     assert line.startswith("SIGHUP: ")
     assert said in line
-    assert line.endswith("; the settings of before stay")
+    assert line.endswith("; keeping the previous settings")
     assert "\n" not in line
     assert said in files.reload.in_force.fault
-    assert files.again(NODE) == "SIGHUP: the files say what they said"
+    assert files.again(NODE) == "SIGHUP: nothing changed"
     assert given == []
     assert files.reload.in_force.fault == ""
 
@@ -109,11 +109,11 @@ def test_one_that_fails_to_take_it_keeps_nobody_else_from_it(files: Files, caplo
     files.reload.takes(fail, "mesh")
     files.reload.takes(given.append, "components")
     line = files.again(NODE.replace("max = 3", "max = 4"), FLEET.replace("1.5", "2.0"))
-    assert line == "SIGHUP: took components.max; restart this node to take mesh.lease"
+    assert line == "SIGHUP: applied components.max; restart this node to apply mesh.lease"
     assert len(given) == 1
-    assert "the new [mesh] can't be taken" in caplog.messages
+    assert "the new [mesh] can't be applied" in caplog.messages
     assert files.reload.in_force.fault == (
-        "mesh.lease: can't be taken: KeyError('a fault of its own'); restart this node"
+        "mesh.lease: can't be applied: KeyError('a fault of its own'); restart this node"
     )
 
 
@@ -171,7 +171,9 @@ def test_rights_are_taken_once_for_all_tables(files: Files) -> None:
     given: list[Node] = []
     files.reload.takes(given.append, "roles", "groups", "quotas")
     line = files.again(NODE, FLEET + RIGHTS)
-    assert line.startswith("SIGHUP: took groups.rcs, quotas.rcs.rcs, roles.client, roles.manager, roles.node.anvil; ")
+    assert line.startswith(
+        "SIGHUP: applied groups.rcs, quotas.rcs.rcs, roles.client, roles.manager, roles.node.anvil; "
+    )
     assert len(given) == 1
 
 
@@ -192,4 +194,4 @@ async def test_a_fault_of_zscout_ends_no_reload(files: Files, monkeypatch: pytes
     line = await files.reload.now()
     assert "the files can't be used: IndexError" in line
     monkeypatch.undo()
-    assert await files.reload.now() == "SIGHUP: the files say what they said"
+    assert await files.reload.now() == "SIGHUP: nothing changed"

@@ -77,4 +77,4 @@ def test_without_a_service_manager_nobody_is_told_and_one_that_is_gone_is_named_
     assert caplog.messages == []
     run(story(ServiceManager(str(tmp_path / "gone"), 1.0)))
     assert len(caplog.messages) == 1
-    assert caplog.messages[0].startswith("the service manager is not told READY=1: [Errno 2]")
+    assert caplog.messages[0].startswith("can't send READY=1 to the service manager: [Errno 2]")

@@ -16,12 +16,10 @@ from zscout.services.bookings.calendar_text import CONTENT_TYPE, CalendarSelecti
 from zscout.services.plain_http import Page, PlainHttpServer
 
 FRESH: Final = 5.0  # seconds for which the leader's answer is reused
-ASK: Final = 2.0  # seconds for its answer
+ASK: Final = 2.0  # seconds for the leader's answer
 MAX_TEXTS: Final = 64  # calendars kept as text
 _PATH: Final = re.compile(rf"/(?:fleet|rc/(?P<rc>{NAME.pattern}/{NAME.pattern})|owner/(?P<owner>{NAME.pattern}))\.ics")
-NOT_NOW: Final = Page(
-    b"no leader tells the bookings now\n", status="503 Service Unavailable", headers="Retry-After: 60\r\n"
-)
+NOT_NOW: Final = Page(b"no leader answers now\n", status="503 Service Unavailable", headers="Retry-After: 60\r\n")
 
 
 class CalendarServer(PlainHttpServer):
@@ -31,7 +29,7 @@ class CalendarServer(PlainHttpServer):
         super().__init__("calendars", bind, port)
         self._mesh, self._fleet = mesh, fleet
         self._one_by_one = asyncio.Lock()
-        self._told: BookingsTold | None = None
+        self._answer: BookingsTold | None = None
         self._asked = float("-inf")
         self._texts: dict[CalendarSelection, bytes] = {}
 
@@ -43,18 +41,18 @@ class CalendarServer(PlainHttpServer):
         async with self._one_by_one:
             if time.monotonic() - self._asked > FRESH:
                 await self._ask()
-            if self._told is None:
+            if self._answer is None:
                 return NOT_NOW
             if selection not in self._texts:
                 if len(self._texts) >= MAX_TEXTS:
                     self._texts.clear()
-                text = await asyncio.to_thread(calendar_text, self._fleet, self._told.bookings, selection)
+                text = await asyncio.to_thread(calendar_text, self._fleet, self._answer.bookings, selection)
                 self._texts[selection] = text
             return Page(self._texts[selection], CONTENT_TYPE)
 
     async def _ask(self) -> None:
         reply = await self._mesh.ask_one(self._mesh.keys.rcm_bookings, BookingsAsk(), BookingsTold, timeout=ASK)
-        told = reply.message if reply is not None else None
-        if told is None or self._told is None or told.bookings != self._told.bookings:
+        answer = reply.message if reply is not None else None
+        if answer is None or self._answer is None or answer.bookings != self._answer.bookings:
             self._texts.clear()
-        self._told, self._asked = told, time.monotonic()
+        self._answer, self._asked = answer, time.monotonic()

@@ -33,7 +33,7 @@ class CalendarSelection(NamedTuple):
 
     @property
     def path(self) -> str:
-        """Its path: `fleet.ics`, `rc/robot/arm1.ics`, `owner/anvil.ics`."""
+        """The path on the server: `fleet.ics`, `rc/robot/arm1.ics`, `owner/anvil.ics`."""
         if self.rc is not None:
             return f"rc/{self.rc}.ics"
         return f"owner/{self.owner}.ics" if self.owner is not None else "fleet.ics"
@@ -78,13 +78,13 @@ def calendar_text(fleet: str, bookings: Iterable[BookingView], selection: Calend
 
 
 def _may_have(view: BookingView, rc: str) -> bool:
-    """Return True if it has `rc` for a pattern, or may get it."""
+    """Return True if the booking has `rc` for a pattern, or may get it."""
     bound = {name for date in view.dates for name in date.bound.values()} or view.maintained
     return rc in bound if bound else any(is_pattern(need) and matcher(need)(rc) for need in view.needs)
 
 
 def _zone(view: BookingView) -> ZoneInfo | None:
-    """None if not repeated, or of a zone unknown here; then its dates are written one by one."""
+    """The booking's zone; None if it is not repeated or the zone is unknown here: then each date is an event."""
     try:
         return zone_of(view.zone) if view.every else None
     except ValueError:
@@ -95,22 +95,22 @@ def _until(view: BookingView) -> Instant:
     return view.start + MAX_AHEAD if view.until is None else view.until
 
 
-@lru_cache(1_024)  # it takes milliseconds, and there are 600 zones
+@lru_cache(1_024)  # a call takes milliseconds, and there are 600 zones
 def _timezone(name: str, first: int, last: int) -> Timezone:
-    """The zone in these years, by yearly rules where possible: some programs ignore all but the first date. icalendar's
-    own misses short periods, such as Morocco's Ramadan."""
+    """The zone in these years, by yearly rules where possible: some programs ignore dates after the first. icalendar's
+    own function misses short periods, such as Morocco's Ramadan."""
     zone, timezone = zone_of(name), Timezone()
     timezone.add("TZID", name)
     begins, ends = (datetime(year, 1, 1, tzinfo=UTC) for year in (first - 1, last + 2))
     changes = dict[tuple[timedelta, timedelta, str], list[datetime]]()
     for at in _changes(zone, begins, ends):
         before, after = _offset(at - timedelta(seconds=1), zone), _offset(at, zone)
-        told = before, after, at.astimezone(zone).tzname() or ""
-        changes.setdefault(told, []).append((at + before).replace(tzinfo=None))
+        change = before, after, at.astimezone(zone).tzname() or ""
+        changes.setdefault(change, []).append((at + before).replace(tzinfo=None))
     if not any(times[0].year < first for times in changes.values()):
         offset = _offset(begins, zone)
-        told = offset, offset, begins.astimezone(zone).tzname() or ""
-        changes = {told: [(begins + offset).replace(tzinfo=None)], **changes}
+        change = offset, offset, begins.astimezone(zone).tzname() or ""
+        changes = {change: [(begins + offset).replace(tzinfo=None)], **changes}
     for (before, after, called), times in changes.items():
         part = TimezoneDaylight() if after > before else TimezoneStandard()
         part.add("DTSTART", times[0])
@@ -142,7 +142,7 @@ def _changes(zone: ZoneInfo, begins: datetime, ends: datetime) -> Iterator[datet
 
 
 def _rule(times: Sequence[datetime]) -> vRecur | None:
-    """The yearly rule of these local times; None: there is none."""
+    """The yearly rule of these local times; None if no rule fits."""
     if len({(at.month, at.weekday(), at.time()) for at in times}) > 1:
         return None
     weeks = {(at.day - 1) // 7 + 1 for at in times}
@@ -159,7 +159,7 @@ def _repeated(fleet: str, view: BookingView, zone: ZoneInfo) -> list[Event]:
     hour = first.time().replace(fold=0)
 
     def nominal(at: Instant) -> datetime:
-        """A date by its rule: clocks differ on a day without that hour."""
+        """A date by its rule; the real date differs on a day without that hour."""
         return datetime.combine(datetime.fromtimestamp(at, zone).date(), hour, zone)
 
     event = _event(fleet, view, first)
@@ -170,10 +170,10 @@ def _repeated(fleet: str, view: BookingView, zone: ZoneInfo) -> list[Event]:
     for at in sorted(given_up):
         event.add("EXDATE", nominal(at))
     found = [event]
-    told = {date.start: date for date in view.dates if date.state == "conflict"}
+    exceptions = {date.start: date for date in view.dates if date.state == "conflict"}
     if nominal(view.start).timestamp() != view.start:
-        told.setdefault(view.start, BookedDate(view.start, view.start, "open"))
-    for at, date in sorted(told.items()):
+        exceptions.setdefault(view.start, BookedDate(view.start, view.start, "open"))
+    for at, date in sorted(exceptions.items()):
         if at not in given_up:
             other = _event(fleet, view, at if at == view.start else nominal(at), date)
             other.add("RECURRENCE-ID", nominal(at))
@@ -181,8 +181,8 @@ def _repeated(fleet: str, view: BookingView, zone: ZoneInfo) -> list[Event]:
     return found
 
 
-def _event(fleet: str, view: BookingView, start: Instant | datetime, told: BookedDate | None = None) -> Event:
-    """One date, or the first of many, with its details."""
+def _event(fleet: str, view: BookingView, start: Instant | datetime, date: BookedDate | None = None) -> Event:
+    """The event of one date, or of the first of many, with the details of `date`."""
     event = Event()
     whole = view.every and not isinstance(start, datetime) and _zone(view) is None
     event.add("UID", f"{view.id}{f'-{start}' if whole else ''}@{fleet}")
@@ -192,15 +192,15 @@ def _event(fleet: str, view: BookingView, start: Instant | datetime, told: Booke
     event.add("DURATION", vText(_duration(math.ceil(view.runtime))), encode=False)
     words = f"{view.name} ({view.owner})" if view.owner else view.name
     event.add("SUMMARY", clean(f"maintenance: {words}" if view.maintenance else words))
-    bound = told.bound if told is not None else {}
+    bound = date.bound if date is not None else {}
     rcs = view.maintained or [bound.get(need, need.partition("#")[0]) for need in sorted(view.needs)]
     event.add("LOCATION", ", ".join(rcs))
     event.add("RESOURCES", rcs)
     event.add("CATEGORIES", rcs)
     comment = view.who.comment if view.who is not None else ""
-    if lines := [clean(text).strip() for text in (comment, told.danger if told is not None else "") if text]:
+    if lines := [clean(text).strip() for text in (comment, date.danger if date is not None else "") if text]:
         event.add("DESCRIPTION", "\n".join(lines))
-    tentative = told is not None and told.state == "conflict"
+    tentative = date is not None and date.state == "conflict"
     event.add("STATUS", "CANCELLED" if view.unbooked else "TENTATIVE" if tentative else "CONFIRMED")
     event.add(NEEDS, " ".join(_need(need, view) for need in sorted(view.needs)))
     event.add(PRIORITY, str(view.priority))
@@ -209,7 +209,7 @@ def _event(fleet: str, view: BookingView, start: Instant | datetime, told: Booke
 
 
 def _need(need: str, view: BookingView) -> str:
-    """As on the command line: `radio/rf0:command_rate=5`."""
+    """A need as on the command line: `radio/rf0:command_rate=5`."""
     amounts = ",".join(f"{name}={value.normalize():f}" for name, value in sorted(view.needs[need].items()))
     return f"{need}:{amounts}" if amounts else need
 

@@ -29,7 +29,7 @@ def zone_of(name: str) -> ZoneInfo:
 
 
 def dates(booking: BookingRecord, after: float, before: float) -> list[Instant]:
-    """Starts from `after`, before `before`, including dates given up. Raises ValueError for an unknown zone."""
+    """Starts from `after` until before `before`, including dates given up. Raises ValueError for an unknown zone."""
     return Repetition(booking).between(after, before)
 
 
@@ -49,7 +49,7 @@ class Repetition:
         return self._known[bisect_left(self._known, after) : bisect_left(self._known, before)]
 
     def first_from(self, time: float) -> float:
-        """The first date from then on; infinite if there is none."""
+        """The first date at `time` or later; infinite if there is none."""
         if not self._booking.every:
             return self._booking.start if self._booking.start >= time else math.inf
         self._find(time, time)
@@ -57,7 +57,7 @@ class Repetition:
         return self._known[at] if at < len(self._known) else math.inf
 
     def _find(self, after: float, before: float) -> None:
-        """Find those from `after`, and the first that is not before `before`."""
+        """Find the dates from `after`, up to the first that is not before `before`."""
         if self._coming is None or after < self._from:
             self._coming, self._known, self._from = _repeated(self._booking, after), [], after
         while not self._known or self._known[-1] < before:
@@ -68,7 +68,7 @@ class Repetition:
 
 
 def last_end(booking: BookingRecord) -> float:
-    """The end of its last date, or later."""
+    """The end of the last date, or a later time."""
     last = booking.start
     if booking.every:
         last = booking.until if booking.until is not None else booking.start + MAX_AHEAD
@@ -76,11 +76,11 @@ def last_end(booking: BookingRecord) -> float:
 
 
 def _repeated(booking: BookingRecord, after: float) -> Iterator[Instant]:
-    """From the last date before `after` to the last of all."""
+    """Yield dates, from one before `after` to the last."""
     zone = zone_of(booking.zone)
     first = datetime.fromtimestamp(booking.start, zone).replace(tzinfo=None)
     last = booking.until if booking.until is not None else booking.start + MAX_AHEAD
-    # Days are 23 to 25 hours long: rather begin too early.
+    # Days have 23 to 25 hours: start one date early.
     count = max(0, int((after - booking.start) // (booking.every * DAY)) - 1)
     while True:
         local = first + timedelta(days=count * booking.every)
@@ -92,7 +92,7 @@ def _repeated(booking: BookingRecord, after: float) -> Iterator[Instant]:
 
 
 def told(time: float, zone: str) -> str:
-    """An instant, for people in that zone."""
+    """Format an instant for people in `zone`."""
     with suppress(ValueError, OverflowError):
         return datetime.fromtimestamp(time, zone_of(zone)).strftime("%Y-%m-%d %H:%M:%S %Z")
     return f"{time:.0f} s after 1970"

@@ -1,7 +1,7 @@
 """Fleet time: the leader's publications give all hosts the same dates. Pure.
 
-It begins as the median of the hosts' clocks, and runs on the leader's monotonic clock. Where most of the hosts' clocks
-differ from it, it is corrected in one step: at once if a clock was set to what they say, else after a minute."""
+It begins as the median of the hosts' clocks, and runs on the leader's monotonic clock. If most clocks of hosts differ
+from fleet time, it is corrected in one step: at once if a clock was just set to their time, else after a minute."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from zscout.types import SECOND, HostName, Ns
 DIFFERS: Final = 2.0  # seconds of a host clock's error before a warning, and before a correction
 LASTS: Final[Ns] = 60 * SECOND  # time for which most clocks differ before a correction
 REMEMBERED: Final[Ns] = 3_600 * SECOND  # the clock of a silent host counts for so long
-MAX_HOSTS: Final = 1_000  # whose clocks count: those read last
+MAX_HOSTS: Final = 1_000  # hosts whose clocks count: those read last
 SAME: Final = 1.0  # seconds: fleet times that began this close together are equally old
 
 
@@ -22,15 +22,15 @@ def wall_ns(seconds: float) -> Ns:
     return round(seconds * SECOND)
 
 
-def agreed(times: Iterable[Ns], goes_on: Ns | None = None, kept: Collection[Ns] = ()) -> Ns:
-    """The median of several clocks at one instant. Of two middle ones the nearer to what clocks say that are `kept` by
-    a time service; else to `goes_on`, the present time, which more may share; else the lower. Raises ValueError for
-    none."""
+def agreed(times: Iterable[Ns], current: Ns | None = None, kept: Collection[Ns] = ()) -> Ns:
+    """The median of several clocks at one instant. Of two middle clocks: the nearer to the agreed time of clocks `kept`
+    synchronised by a time service; else the nearer to `current`, the present fleet time, which more hosts may share;
+    else the lower. Raises ValueError for no clocks."""
     all_times = sorted(times)
     if kept:
-        goes_on = agreed(kept, goes_on)
+        current = agreed(kept, current)
     low, high = median_low(all_times), median_high(all_times)
-    return high if goes_on is not None and abs(high - goes_on) < abs(low - goes_on) else low
+    return high if current is not None and abs(high - current) < abs(low - current) else low
 
 
 def _differ(offset: Ns, other: Ns) -> bool:
@@ -38,8 +38,7 @@ def _differ(offset: Ns, other: Ns) -> bool:
 
 
 class _Clock(NamedTuple):
-    """A host's clock as it was read last: by how much it was ahead of the own one, when, and if a time service keeps
-    it."""
+    """A host's clock as last read: how far ahead of the own clock, when, and if a time service synchronises it."""
 
     offset: Ns
     at: Ns
@@ -54,9 +53,9 @@ class FleetClock:
         self.since = since
         self._hosts: dict[HostName, _Clock] = {}
         self.corrected: tuple[Ns, Ns] | None = None
-        """By how much it was corrected last, and when."""
+        """Size and time of the last correction."""
         self._doubted: tuple[Ns, Ns] | None = None
-        """What most clocks say instead, as such an offset, and since when."""
+        """The offset on which most clocks agree instead, and since when."""
         self.step(time, now)
 
     def at(self, now: Ns) -> Ns:
@@ -64,15 +63,14 @@ class FleetClock:
         return now + self._offset
 
     def step(self, time: Ns, now: Ns) -> None:
-        """Set it to `time` at `now`."""
+        """Set fleet time to `time` at `now`."""
         self._offset, self.set_at, self._doubted = time - now, now, None
 
     def correct(self, walls: Mapping[HostName, Ns], now: Ns, kept: Collection[HostName] = ()) -> Ns:
-        """Compare it with hosts' clocks as they were read at `now`, of which some are `kept` by a time service. Returns
-        by how much it is corrected; 0: it is not.
+        """Compare fleet time with hosts' clocks read at `now`, of which a time service synchronises those in `kept`.
+        Return the correction, 0 if there is none.
 
-        Hosts that are not among them count as they did within the last hour: a host that is alone for a while is not
-        the majority."""
+        Missing hosts count with their clocks of the last hour: a host that is alone for a while is not the majority."""
         offsets, before = {host: wall - now for host, wall in walls.items()}, self._hosts
         silent = [item for item in before.items() if item[0] not in walls and now - item[1].at < REMEMBERED]
         latest = [(host, _Clock(offset, now, host in kept)) for host, offset in offsets.items()]

@@ -1,16 +1,16 @@
-"""Whether a time service keeps this host's clock, by the kernel."""
+"""Ask the kernel whether a time service synchronises this host's clock."""
 
 from __future__ import annotations
 
 import ctypes
 from typing import Final
 
-TIME_ERROR: Final = 5  # what adjtimex returns where nothing keeps the clock
-TIMEX: Final = 256  # bytes that are enough for its struct on any platform
+TIME_ERROR: Final = 5  # result of adjtimex for an unsynchronised clock
+TIMEX: Final = 256  # bytes; enough for its struct on any platform
 
 
 def is_synchronised() -> bool | None:
-    """None where the kernel can't be asked."""
+    """Return None if the kernel can't be asked."""
     try:
         code = ctypes.CDLL(None).adjtimex(ctypes.create_string_buffer(TIMEX))
     except (OSError, AttributeError):

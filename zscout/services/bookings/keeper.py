@@ -1,7 +1,7 @@
 """One host's copy of the fleet's bookings: in memory, and on disk with a state folder.
 
-Each host that may lead or has RCs keeps one. The leader alone shares bookings: it asks all hosts at once to keep its
-records, and the answers bring back those it lacks."""
+Each host that may lead or has RCs has a copy. Only the leader shares bookings: it asks all hosts at once to store its
+records, and their answers contain the records that it lacks."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ FILE: Final = "bookings.json"
 ASIDE: Final = "bookings.damaged.json"
 MAX_SAVING: Final = 16  # answers awaiting the disk at one time
 UNASKED: Final[Ns] = 40 * SECOND
-"""A keeper with a leader but no query for so long is not seen: each is asked every 30 s."""
+"""A keeper that gets no query from a leader for so long is invisible to it: each keeper is queried every 30 s."""
 LEFT: Final[Ns] = 5 * SECOND  # silence after which a leader counts as new
-APART: Final = 500  # clocks of two hosts run apart by less than one part in so many
+APART: Final = 500  # clocks of two hosts drift apart by less than one part in so many
 
 
 class _BookingFile(msgspec.Struct):
@@ -43,7 +43,7 @@ class _BookingFile(msgspec.Struct):
 class Disk(Protocol):
     def read(self) -> list[messages.BookingRecord]: ...
     async def write(self, records: list[messages.BookingRecord]) -> None:
-        """Return once they are on disk. Raises OSError."""
+        """Return once `records` are on disk. Raises OSError."""
 
 
 class BookingFile:
@@ -72,16 +72,16 @@ class BookingFile:
             except messages.Malformed as error:
                 log.warning("a booking in %s can't be read, and is left out: %s", self._path, error)
         if len(found) < len(kept.records):
-            log.warning("%s is not used whole%s", self._path, self._set_aside())
+            log.warning("%s is used only in part%s", self._path, self._set_aside())
         return found
 
     def _set_aside(self) -> str:
-        """Keep a copy, replacing the last; return a remark for the log."""
+        """Copy the file aside, replacing the last copy; return a remark for the log."""
         try:
             shutil.copy(self._path, self._path.with_name(ASIDE))
         except OSError as error:
-            return f" (and can't be set aside: {error.strerror})"
-        return f" (a copy stays as {ASIDE})"
+            return f" (and can't be copied: {error.strerror})"
+        return f" (a copy is kept as {ASIDE})"
 
     async def write(self, records: list[messages.BookingRecord]) -> None:
         content = messages.encode(
@@ -91,8 +91,8 @@ class BookingFile:
 
 
 class BookingKeeper:
-    """`wall`: the host's clock, in seconds since 1970 (UTC); None: the present time, running on by the mesh's clock.
-    `synchronised`: if a time service keeps it."""
+    """Stores bookings and answers the leader. `wall`: the host's clock in seconds since 1970 (UTC); None: the present
+    time, continued by the mesh's clock. `synchronised`: True if a time service synchronises that clock."""
 
     def __init__(
         self,
@@ -110,9 +110,9 @@ class BookingKeeper:
         self.records = Records()
         self._offset: Ns | None = None  # fleet time minus the own clock, at the last publication
         self.heard: tuple[Term, Ns] = NO_TERM, 0  # term and time of that publication
-        self._run: Ns = 0  # fleet time at the beginning of its run, by that publication; a correction moves it
+        self._run: Ns = 0  # fleet time at the start of its run, by that publication; a correction moves it
         self._leader: tuple[Term, Ns, Ns] = NO_TERM, 0, 0
-        """Present leader's term, with its first and last publication."""
+        """The present leader's term, and the times of its first and last publication."""
         self._asked: Ns = 0  # last query of a leader
         self._saved = self.records.digest()  # digest of the records on disk
         self._saving = asyncio.Lock()
@@ -131,8 +131,8 @@ class BookingKeeper:
             self.mesh.serve(key, messages.ShareBookings, guard(self._on_shared), limit=messages.MAX_STATE)
         ]
         if not self._candidate:
-            # Candidates pass publications on by themselves. Others need no fleet time, but watch the leader.
-            watch = guard(lambda _key, grants: self._look_whether_asked(grants))
+            # Candidates call `hear` themselves. Other hosts need no fleet time, but watch the leader.
+            watch = guard(lambda _key, grants: self._check_queried(grants))
             self._declared.append(self.mesh.subscribe(keys.grants, messages.Grants, watch))
 
     def stop(self) -> None:
@@ -140,12 +140,12 @@ class BookingKeeper:
             declared.close()
 
     def hear(self, grants: messages.Grants) -> None:
-        """Take a publication of the leader. One that was delayed, even from an earlier leader while this process
-        stalled, shows too early a time; the beginning of a run is the same however late it is read. A leader that
-        began without fleet time has a younger one, until it learns ours."""
+        """Take a publication of the leader. A delayed publication, such as an earlier leader's after a stall, shows too
+        early a time; the start of the run of fleet time does not depend on the delay. A leader that began without fleet
+        time has a younger time, until it learns ours."""
         if grants.time is None:
             return
-        self._look_whether_asked(grants)
+        self._check_queried(grants)
         now, (_, at) = self.mesh.now(), self.heard
         offset, run = round(grants.time * SECOND) - now, round((grants.time - grants.time_age) * SECOND)
         if self._offset is not None:
@@ -155,14 +155,14 @@ class BookingKeeper:
                 return
         self._offset, self._run, self.heard = offset, run, (grants.term, now)
 
-    def _look_whether_asked(self, grants: messages.Grants) -> None:
-        """A leader that knows bookings asks each keeper that it sees."""
+    def _check_queried(self, grants: messages.Grants) -> None:
+        """Suspect the link if a leader with fleet time does not query this keeper."""
         if grants.time is None:
             return
         now, (leader, since, last) = self.mesh.now(), self._leader
         self._leader = grants.term, since if leader == grants.term and now - last < LEFT else now, now
         unasked = now - max(self._asked, self._leader[1]) > UNASKED
-        self.mesh.suspicions.suspect("a known leader asks nothing about bookings", so=unasked)
+        self.mesh.suspicions.suspect("the leader does not query this host's bookings", so=unasked)
 
     @property
     def time(self) -> Ns | None:
@@ -171,7 +171,7 @@ class BookingKeeper:
 
     @property
     def age(self) -> float:
-        """For how many seconds that time has gone on."""
+        """Seconds for which fleet time has run."""
         return 0.0 if self.time is None else max(0, self.time - self._run) / SECOND
 
     async def save(self) -> bool:

@@ -1,6 +1,6 @@
 """Records of bookings, merged to the same result in any order. Pure.
 
-Changes only accumulate: a record, or dates of it, are given up or over. So an old copy brings nothing back."""
+Final facts only accumulate (a record, or a date, was given up or is over), so an old copy restores nothing."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class Records:
         self._records: dict[str, BookingRecord] = {}
         self._encoded: dict[str, bytes] = {}
         self.size = 0  # encoded bytes
-        self.latest = Grant(NO_TERM, 0)  # the number of the last change of any record
+        self.latest = Grant(NO_TERM, 0)  # number of the last change of any record
         self._digest: str | None = None
 
     def __iter__(self) -> Iterator[BookingRecord]:
@@ -74,7 +74,7 @@ class Records:
         return changed
 
     def remove(self, booking: str) -> None:
-        """Remove it without a trace."""
+        """Remove the record, leaving no trace."""
         if self._records.pop(booking, None) is not None:
             self.size -= len(self._encoded.pop(booking))
             self._digest = None
@@ -87,7 +87,7 @@ class Records:
         return bool(old)
 
     def digest(self) -> str:
-        """Equal for equal records."""
+        """A digest that is equal for equal records."""
         if self._digest is None:
             encoded = b"".join(self._encoded[booking] for booking in sorted(self._encoded))
             self._digest = hashlib.sha256(encoded).hexdigest()[:32]

@@ -16,7 +16,7 @@ CONTENT_TYPE = CONTENT_TYPE_PLAIN_0_0_4
 
 
 class Exposition:
-    """For any thread, one at a time."""
+    """Usable from any thread, one at a time."""
 
     def __init__(self) -> None:
         self._samples: Samples = {}
@@ -29,10 +29,10 @@ class Exposition:
         return generate_latest(self._registry)
 
     def collect(self) -> Iterator[Metric]:
-        """For the registry."""
+        """Called by the registry."""
         for name, samples in self._samples.items():
             family = FAMILIES[name]
-            # Two texts that are the same once cleaned would make the whole page invalid: the last stands.
+            # Label texts that are equal once cleaned would make the whole page invalid: the last is kept.
             values = {tuple(map(clean, labels)): value for labels, value in samples.items()}
             if family.kind == "histogram":
                 histogram = HistogramMetricFamily(name, family.help, labels=family.labels)

@@ -19,9 +19,9 @@ from zscout.types import SECOND, ArcId, Ns, RcName
 MAX_WAITERS: Final = 100  # pairs of a priority and a group
 MAX_RCS: Final = 1_000
 MAX_WAIT: Final[Ns] = 90 * 86_400 * SECOND
-"""Longer waits count as this: a client alone reports a wait under an earlier RCM."""
+"""Limit of a counted wait: a wait under an earlier RCM is only reported by its client."""
 WAITS: Final = (0.01, 0.1, 1.0, 5.0, 15.0, 60.0, 300.0, 900.0, 3_600.0, 14_400.0, 86_400.0)
-"""Seconds: bounds of the buckets."""
+"""Bounds of the buckets, in seconds."""
 ERRORS: Final = (-3_600.0, -900.0, -300.0, -60.0, -15.0, -1.0, 0.0, 1.0, 15.0, 60.0, 300.0, 900.0, 3_600.0)
 
 
@@ -41,25 +41,25 @@ FAMILIES: Final[Mapping[str, MetricFamily]] = {
     "zscout_terms_led_total": MetricFamily("counter", (), "Times that this node took the lead."),
     "zscout_queue_length": MetricFamily("gauge", (), "ARCs that wait."),
     "zscout_wait_seconds": MetricFamily(
-        "histogram", ("priority", "group"), "From when an ARC was queued to its grant; not of holds that went on."
+        "histogram", ("priority", "group"), "From queueing of an ARC to its grant, without holds that continued."
     ),
     "zscout_forecast_error_seconds": MetricFamily(
-        "histogram", (), "Of grants that were foretold to their client: start less what was foretold first."
+        "histogram", (), "Start of a hold minus the first forecast sent to its client."
     ),
     "zscout_preemptions_total": MetricFamily(
-        "counter", ("priority", "group"), "Holds taken away for another ARC, by whose they were."
+        "counter", ("priority", "group"), "Holds preempted for another ARC, by the preempted ARC."
     ),
     "zscout_holds": MetricFamily("gauge", ("rc",), "Holders that the RC has."),
     "zscout_held_seconds_total": MetricFamily(
         "counter", ("rc",), "Time for which the RC was held, summed over its holders."
     ),
-    "zscout_refusals_total": MetricFamily("counter", ("code",), "Requests and releases that the RCM refused, by why."),
+    "zscout_refusals_total": MetricFamily("counter", ("code",), "Requests and releases that the RCM refused, by code."),
     "zscout_unwell_seconds": MetricFamily(
         "gauge", ("rc",), "For how long the RC has been unwell; 0 while it is well, and once it is lost."
     ),
     "zscout_lost": MetricFamily("gauge", ("rc",), "1 while the RC counts as lost, else 0."),
     "zscout_commands_total": MetricFamily("counter", ("rc",), "Commands that the RC has answered."),
-    "zscout_commands_refused_total": MetricFamily("counter", ("rc", "code"), "Commands that it refused, by why."),
+    "zscout_commands_refused_total": MetricFamily("counter", ("rc", "code"), "Commands that the RC refused, by code."),
 }
 
 
@@ -112,7 +112,7 @@ class HoldFigures:
         self._holds: dict[ArcId, Began] = {}
 
     def take(self, access: AccessPolicy) -> None:
-        """Replace the groups. Of several groups of a name, the first counts."""
+        """Replace the groups. A name in several groups counts for the first."""
         self._groups: dict[str, str] = {}
         for group, members in access.groups.items():
             for member in members:
@@ -136,7 +136,7 @@ class HoldFigures:
             self._preemptions[who] = self._preemptions.get(who, 0) + 1
 
     def on_unwell(self, rc: RcName, why: str, holders: Sequence[ArcRequest]) -> None:
-        """The RC's own node shows it."""
+        """Ignored: the RC's own node shows it."""
 
     def _who(self, began: Began) -> tuple[str, ...]:
         owner = began.request.client.partition("/")[0]

@@ -27,8 +27,8 @@ log = logging.getLogger("zscout.components")
 
 MAX_ENDED: Final = 64  # ended components still listed
 MAX_UNDERWAY: Final = 512  # operations at one time
-MAKE_WAY: Final = 5.0  # seconds for a leaving incarnation before its successor is refused
-GRACE: Final = 2.0  # seconds for components to end with their node
+MAKE_WAY: Final = 5.0  # seconds for a leaving incarnation to end before its successor is refused
+GRACE: Final = 2.0  # seconds for components to end when their node stops
 
 
 class ComponentHost:
@@ -73,7 +73,7 @@ class ComponentHost:
         await self.supervisor.close()
 
     def take(self, rules: ComponentsConfig) -> None:
-        """Rules for later starts; running components continue."""
+        """Take new rules for later starts; running components continue."""
         self._rules = rules
 
     def running(self) -> list[RunningComponent]:
@@ -129,7 +129,7 @@ class ComponentHost:
     async def _start(self, start: messages.StartComponent) -> msgspec.Struct:
         before = self._living.get(start.component)
         if before is not None and before.leaving and start.incarnation > before.start.incarnation:
-            # It moved away, failed or stops: its successor may come before the end.
+            # It moved away, failed or stops: its successor may be started before its end.
             await done_within(MAKE_WAY, before.over.wait())
         process = self._same(start) or await self._launch(start)
         await process.settled.wait()
@@ -138,7 +138,7 @@ class ComponentHost:
     async def _launch(self, start: messages.StartComponent) -> ComponentProcess:
         self._check(start)
         kinds = await self._installed()
-        # A start may have come meanwhile.
+        # Another start may have arrived meanwhile.
         if process := self._same(start):
             return process
         where = kinds.get(start.spec.kind)
@@ -161,7 +161,7 @@ class ComponentHost:
         )
         self._living[name] = process
         process.begin(self.supervisor)
-        log.info("starts %s.%d (%s)", name, start.incarnation, start.spec.kind)
+        log.info("starting %s.%d (%s)", name, start.incarnation, start.spec.kind)
         return process
 
     def _same(self, start: messages.StartComponent) -> ComponentProcess | None:
@@ -174,7 +174,7 @@ class ComponentHost:
         if start.incarnation <= known:
             raise Refused("old_incarnation", f"{name} was already started here as incarnation {known}")
         if name in self._living:
-            raise Refused("runs_already", f"incarnation {known} of {name} lives here; stop it first")
+            raise Refused("runs_already", f"incarnation {known} of {name} runs here; stop it first")
         return None
 
     def _check(self, start: messages.StartComponent) -> None:
@@ -197,7 +197,7 @@ class ComponentHost:
         return messages.ComponentList(self.mesh.me.host, views, self._startable(kinds)[:MAX_KINDS])
 
     async def _installed(self) -> dict[str, str]:
-        """Those who ask at one time share one look."""
+        """Concurrent callers share one search."""
         if self._looking is None or self._looking.done():
             self._looking = asyncio.ensure_future(asyncio.to_thread(self._kinds))
         return await asyncio.shield(self._looking)
@@ -209,7 +209,7 @@ class ComponentHost:
         return sorted(kind for kind in kinds if allowed is None or kind in allowed)
 
     def _find(self, name: str, incarnation: int | None = None, *, old: str = "old_incarnation") -> ComponentProcess:
-        """`old` is the code if a higher incarnation was started here: the one meant has ended."""
+        """`old`: the refusal code if a higher incarnation was started here, so that the requested one has ended."""
         process = self._living.get(name) or self._ended.get(name)
         if process is None:
             raise Refused("unknown_component", f"there is no component {quoted(name[:80])} on this host")

@@ -1,4 +1,4 @@
-"""Output of a component: the end is kept, and a flood is held back."""
+"""Output of a component: its end is kept, and its rate limited."""
 
 from __future__ import annotations
 
@@ -36,7 +36,8 @@ class OutputRing:
             del self._bytes[: -self._size]
 
     def read(self, start: int) -> tuple[int, int, str]:
-        """Start, end and text from byte `start`, U+FFFD for invalid UTF-8, without an incomplete last character."""
+        """Return start, end and text from byte `start`, with U+FFFD for invalid UTF-8, without an incomplete last
+        character."""
         first = min(max(start, self.start), self.end)
         decoder = codecs.getincrementaldecoder("utf-8")("replace")
         text = decoder.decode(self._bytes[first - self.start :], final=self.over)
@@ -74,7 +75,7 @@ class OutputReader:
             self._again = self._loop.call_later(-self._credit / RATE, self._loop.add_reader, self._fd, self._readable)
 
     def _read(self) -> int | None:
-        """Bytes read; None: nothing now, 0: the other end is closed."""
+        """Return the number of bytes read; None: nothing available, 0: the other end is closed."""
         try:
             data = os.read(self._fd, CHUNK)
         except BlockingIOError:

@@ -32,7 +32,7 @@ from zscout.types import SECOND, Ns
 
 log = logging.getLogger("zscout.components")
 
-LINGER: Final = 2.0  # seconds from a process's last message to its end
+LINGER: Final = 2.0  # seconds that a process may run after its last message
 SLACK: Final = 5.0  # seconds for an answer, beyond those for carrying out the order
 
 
@@ -68,7 +68,7 @@ class ComponentProcess:
         self._child: subprocess.Popen[bytes] | None = None
         self._orders: asyncio.Queue[bytes] | None = None  # messages to its process, while connected
         self._group = ComponentGroup(0, 0)
-        self._verdict: EndReport | None = None  # the outcome if this node ends it
+        self._verdict: EndReport | None = None  # the outcome if this node kills it
         self._end_report: EndReport | None = None
         self._gone = False  # its process ended, cleanup continues
         self._waiting: dict[int, asyncio.Future[OrderAnswer]] = {}
@@ -77,7 +77,7 @@ class ComponentProcess:
 
     @property
     def pid(self) -> int | None:
-        """Of its process, until that was waited for."""
+        """The process id, until the process was waited for."""
         return self._child.pid if self._child is not None and self._child.returncode is None else None
 
     @property
@@ -126,7 +126,7 @@ class ComponentProcess:
         return messages.Checkpoint(start.component, start.incarnation, answer.state)
 
     async def move(self, order: MoveComponent) -> Moved:
-        """A repeated order returns the outcome of the same move."""
+        """Move it; a repeated order returns the outcome of the same move."""
         if self.moved is not None and self.moved.incarnation == order.to_incarnation:
             return self.moved
         if self._moving is not None and not self._moving[1].done():
@@ -276,7 +276,7 @@ class ComponentProcess:
             while (report := await channel.read(stream, channel.ComponentReport)) is not None:
                 self._on_message(report)
         except channel.BadFrame as error:
-            self._kill(EndReport("failed", f"it was killed: what it sent to its node is no message: {error}"))
+            self._kill(EndReport("failed", f"it was killed: it sent its node an invalid message: {error}"))
 
     def _on_message(self, report: channel.ComponentReport) -> None:
         match report:
@@ -331,7 +331,7 @@ class ComponentProcess:
                 event.set()
 
     def _how(self) -> EndReport:
-        """The outcome without a final report."""
+        """The outcome if the process sent no final report."""
         if self._verdict is not None:
             return self._verdict
         code = self._child.returncode if self._child is not None else None
@@ -340,7 +340,7 @@ class ComponentProcess:
         if code is not None and code < 0:
             known = {number.value: number.name for number in signal.Signals}
             return EndReport("failed", f"killed by {known.get(-code, f'signal {-code}')}")
-        words = f"its process left with code {code} and without a word"
+        words = f"its process exited with code {code} without a report"
         return EndReport("failed", words, bad_params=code == BAD_PARAMS)
 
 

@@ -44,13 +44,13 @@ class ComponentGroup:
 
     @property
     def missing(self) -> str:
-        """The limits this host can't set, in words."""
+        """The limits that this host can't set, in words."""
         parts = []
         if self.memory and not self.memory_set:
             parts.append("memory_limit holds for each of its processes, not for all together")
         if self.cpu and not self.cpu_set:
             parts.append("cpu_limit can't be set")
-        return f"{' and '.join(parts)}: this host lets its node make no control groups" if parts else ""
+        return f"{' and '.join(parts)}: the node may not make control groups on this host" if parts else ""
 
     def enter(self, pid: int) -> None:
         """Add a process, with all its later children. Raises OSError."""
@@ -60,7 +60,7 @@ class ComponentGroup:
     def settle(self) -> None:
         """The component is ready: replace START_CORES, which speed its start, by its limit."""
         if self.throttle is not None:
-            with suppress(OSError):  # it has ended meanwhile
+            with suppress(OSError):  # the group has ended meanwhile
                 _write(*self.throttle)
 
     def overdrawn(self) -> bool:
@@ -152,7 +152,7 @@ def _make(group: ComponentGroup, folder: Path, wanted: dict[str, str], also: dic
         for name, value in wanted.items():
             _write(folder / name, value)
     except OSError as error:
-        log.info("no limits by %s: %s", folder, error)
+        log.info("can't use %s for limits: %s", folder, error)
         with suppress(OSError):
             folder.rmdir()
         return False
@@ -185,7 +185,7 @@ def _may_delegate(base: Path, controller: str) -> bool:
                 _write(base / LEAF / "cgroup.procs", str(pid))
             _write(switch, f"+{controller}")
     except OSError as error:
-        log.info("no limits by %s: %s", base, error)
+        log.info("can't use %s for limits: %s", base, error)
         return False
     return True
 

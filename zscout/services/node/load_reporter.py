@@ -81,7 +81,7 @@ class LoadReporter:
         self._publisher.close()
 
     def _with_files(self, report: LoadReport) -> LoadReport:
-        """With what the node says of its certificate, of its files and of its recorder."""
+        """Add the node's certificate, files and recorder to a report."""
         if self._recorder is not None:
             report = replace(report, recorder=self._recorder.fault[:MAX_ERROR])
         if (files := self._files) is not None:
@@ -105,9 +105,9 @@ class LoadReporter:
             due = max(due + PERIOD, loop.time())
             try:
                 report = await asyncio.to_thread(gauge.report)
-            except Exception:  # a host that can't be measured once may be the next time
+            except Exception:  # the next measurement may succeed
                 if not failed:
-                    log.exception("this host's load can't be measured; it is tried again every second")
+                    log.exception("this host's load can't be measured; retrying every second")
                 failed = True
             else:
                 failed = False
@@ -124,7 +124,7 @@ class TreeLoad:
         self._uses = host_figures.Paced(self._measure, least=PERIOD / 2, share=TREE_SHARE)
 
     def __call__(self, size: float, ram: host_figures.HostMemory) -> LoadFigures:
-        """For so many cores, with this memory; CPU use since the last measurement."""
+        """The load on `size` cores and `ram` memory; CPU use since the last call."""
         use = self._uses()
         return self._averages, min(100.0, 100 * use.cores / size), max(0, ram.total - use.memory)
 
@@ -176,7 +176,7 @@ class Gauge:
         )
 
     def _host_load(self, size: float, ram: host_figures.HostMemory) -> LoadFigures:
-        """Of the host, or of a limited container; CPU use since the last call."""
+        """Load of the host, or of a container with limits; CPU use since the last call."""
         return os.getloadavg(), self._cpu.percent(size), ram.available
 
     def _measure_speed(self) -> float:

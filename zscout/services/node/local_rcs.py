@@ -43,7 +43,7 @@ class _Running:
 
 class LocalRcs:
     """`folder` returns the state folder, if there is one. `on_failure` is called with the error of an RC that fails
-    later. Raises BadInput where a driver is missing."""
+    later. Raises BadInput if a driver is missing."""
 
     def __init__(
         self,
@@ -63,13 +63,13 @@ class LocalRcs:
         return [running.rc for running in self._running.values()]
 
     async def start(self) -> None:
-        """Start all. Raises MeshError and RcNotOpened at the first that can't be."""
+        """Start all. Raises MeshError or RcNotOpened at the first RC that can't be started."""
         for spec in _robots_last(self._node.rcs):
             await self._open(spec, self._drivers.pop(spec.name))
 
     async def take(self, node: Node) -> None:
-        """Stop RCs that the file no longer lists, start new ones; a changed table is both. All others go on. Raises
-        RcNotOpened once all have been tried."""
+        """Stop RCs that the file no longer lists, start new ones, and restart those whose table changed; the others
+        continue. Raises RcNotOpened once all have been tried."""
         wanted, faults = {spec.name: spec for spec in node.rcs}, list[str]()
         gone = [name for name, running in self._running.items() if wanted.get(name) != running.spec]
         await self._close(gone, {name: "changed in" if name in wanted else "removed from" for name in gone})
@@ -111,7 +111,7 @@ class LocalRcs:
                 raise
             log.exception("%s can't be opened", spec.name)
             raise RcNotOpened(f"{spec.name} can't be opened: {error!r}; see the log") from error
-        log.info("runs %s (%s)", spec.name, driver_name(spec))
+        log.info("started %s (%s)", spec.name, driver_name(spec))
 
     async def _close(self, names: Collection[RcName], why: dict[RcName, str]) -> None:
         """Robots first: the last packet to a robot goes through a radio, which may be one of this node."""
@@ -125,11 +125,11 @@ class LocalRcs:
         for name in names:
             del self._running[name]
             if name in why:
-                log.info("runs %s no longer: it was %s the node file", name, why[name])
+                log.info("stopped %s: it was %s the node file", name, why[name])
 
 
 def tolerance(spec: RcConfig, driver: Driver) -> Tolerance:
-    """What the table of an RC says, else its driver."""
+    """Seconds from the table of an RC, else from its driver."""
     held = round(driver.tolerate * SECOND) if spec.tolerate is None else spec.tolerate
     most = max(held, round(driver.tolerate_max * SECOND)) if spec.tolerate_max is None else spec.tolerate_max
     return Tolerance(held, spec.tolerate_free, most)

@@ -162,7 +162,7 @@ class TreeMeter:
 
 
 def faded(averages: tuple[float, ...], wanted: float, seconds: float) -> tuple[float, float, float]:
-    """Averages over 1, 5 and 15 minutes after `wanted` cores for so many seconds, fading like the kernel's."""
+    """Load averages over 1, 5 and 15 minutes after `wanted` cores for `seconds`, decaying like the kernel's."""
     first, second, third = (
         wanted + (past - wanted) * math.exp(-seconds / (60 * minutes))
         for past, minutes in zip(averages, (1, 5, 15), strict=True)
@@ -186,12 +186,12 @@ def _parse(stat: bytes) -> _Process | None:
             started=int(fields[19]) * TICK,
             memory=max(0, int(fields[21])) * PAGE,
         )
-    except (ValueError, IndexError):  # it ended just now
+    except (ValueError, IndexError):  # the process has just ended
         return None
 
 
 def _tasks(proc: Path, pids: Iterable[int], file: str) -> Iterator[tuple[int, bytes]]:
-    """This file of each thread, at most MAX_THREADS: a process's own folder has only the first one's."""
+    """Contents of `file` for each thread, at most MAX_THREADS: a process's own folder has only its first thread's."""
     tasks = ((f"{proc}/{pid}/task", name) for pid in pids for name in _names(f"{proc}/{pid}/task"))
     for folder, name in islice(tasks, MAX_THREADS):
         yield int(name), _read(f"{folder}/{name}/{file}")
@@ -202,18 +202,18 @@ def _threads(proc: Path, pids: Iterable[int]) -> dict[int, _Demand]:
     for thread, figures in _tasks(proc, pids, "schedstat"):
         try:
             ran, waited, *_ = map(int, figures.split())
-        except ValueError:  # it ended just now, or the system lacks the figure
+        except ValueError:  # the thread has just ended, or the system lacks the figure
             continue
         found[thread] = ran, waited
     return found
 
 
 def _demand(before: Mapping[int, _Demand], now: Mapping[int, _Demand]) -> _Demand:
-    """Time ran and waited since, by the present threads."""
+    """Time that the present threads ran and waited since `before`."""
     ran = waited = 0
     for thread, (ran_now, waited_now) in now.items():
         ran_then, waited_then = before.get(thread, (0, 0))
-        if ran_now < ran_then or waited_now < waited_then:  # another of the same number
+        if ran_now < ran_then or waited_now < waited_then:  # another thread with the same number
             ran_then = waited_then = 0
         ran += ran_now - ran_then
         waited += waited_now - waited_then

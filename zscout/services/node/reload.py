@@ -35,7 +35,7 @@ class FilesInForce:
 
 
 class Reload:
-    """The settings in force, and the functions that apply new ones. `read` raises BadInput, and so does this."""
+    """The settings in force, and the functions that apply new ones. `read` raises BadInput, and so does `Reload`."""
 
     def __init__(self, read: Callable[[], Node]) -> None:
         self._read = read
@@ -45,8 +45,8 @@ class Reload:
         self._asked = asyncio.Event()
 
     def takes(self, take: Callable[[Node], object], *tables: str) -> None:
-        """Call `take` in the event loop with settings changed in these tables or keys; it may return an awaitable. Its
-        errors are logged, and old settings stay."""
+        """Call `take` in the event loop with the new settings after a change of these tables or keys; it may return an
+        awaitable. Its errors are logged, and the previous settings stay in force."""
         self._takers.append((frozenset(tables), take))
 
     def on_hangup(self) -> None:
@@ -68,16 +68,16 @@ class Reload:
             manager.ready(f"{status}; {await self.now()}")
 
     async def now(self) -> str:
-        """Read the files; return the line that is logged."""
+        """Read and apply the files; return the line that is logged."""
         try:
-            # They may be on another host.
-            node, said = await asyncio.to_thread(self._checked)
+            # In a thread: the files may be on another host.
+            node, found = await asyncio.to_thread(self._checked)
         except BadInput as error:
             self.in_force.fault = str(error)
-            line = f"SIGHUP: {error}; the settings of before stay"
+            line = f"SIGHUP: {error}; keeping the previous settings"
             log.warning("%s", line)
             return line
-        changed = {key for key in self._taken.keys() | said.keys() if self._taken.get(key) != said.get(key)}
+        changed = {key for key in self._taken.keys() | found.keys() if self._taken.get(key) != found.get(key)}
         took, faults = set[str](), list[str]()
         for tables, take in self._takers:
             keys = {key for key in changed if key in tables or _table(key) in tables}
@@ -85,24 +85,24 @@ class Reload:
                 if keys and inspect.isawaitable(taking := take(node)):
                     await taking
             except Exception as error:
-                log.exception("the new [%s] can't be taken", "], [".join(sorted(set(map(_table, keys)))))
-                faults.append(f"{_listed(keys)}: can't be taken: {error!r}; restart this node")
+                log.exception("the new [%s] can't be applied", "], [".join(sorted(set(map(_table, keys)))))
+                faults.append(f"{_listed(keys)}: can't be applied: {error!r}; restart this node")
                 continue
             took |= keys
         self._taken = {key: value for key, value in self._taken.items() if key not in took}
-        self._taken |= {key: said[key] for key in took & said.keys()}
+        self._taken |= {key: found[key] for key in took & found.keys()}
         self.in_force.fault = "; ".join(faults)
         if not faults:
             self.in_force.rights = rights_of(node)
-        words = [f"took {_listed(took)}"] if took else []
+        words = [f"applied {_listed(took)}"] if took else []
         if later := changed - took:
-            words.append(f"restart this node to take {_listed(later)}")
-        line = f"SIGHUP: {'; '.join(words) or 'the files say what they said'}"
+            words.append(f"restart this node to apply {_listed(later)}")
+        line = f"SIGHUP: {'; '.join(words) or 'nothing changed'}"
         log.log(logging.WARNING if later else logging.INFO, "%s", line)
         return line
 
     def _checked(self) -> tuple[Node, dict[str, object]]:
-        """What the files say, as a node and by key, if a node could start with it. Raises BadInput."""
+        """The settings of the files, as a node and by key. Raises BadInput if a node could not start with them."""
         try:
             node = self._read()
             for rc in node.rcs:
@@ -131,14 +131,14 @@ def settings(node: Node) -> dict[str, object]:
         del fleet[name]
     of_policy = {field.name: getattr(policy, field.name) for field in fields(policy)}
     found = {f"rc.{rc.name}": rc for rc in node.rcs} | {"fair_shares": of_policy.pop("fair_shares")}
-    # Some keys of the policy are those of [limits].
+    # Some keys of the policy belong to [limits].
     fleet |= {name: value for name, value in of_policy.items() if not hasattr(node.fleet.limits, name)}
     found |= _by_key("node", own) | _by_key("fleet", fleet | structs.asdict(access))
     return {key: value for key, value in found.items() if value is not None}
 
 
 def _by_key(table: str, values: Mapping[str, Any]) -> dict[str, object]:
-    """The fields by key: tables among them have their own name, the others stand in `table`."""
+    """The fields by key: tables among them have names of their own, other fields belong to `table`."""
     return {
         key: inner
         for name, value in values.items()

@@ -38,27 +38,27 @@ class ServiceManager:
         return cls(address, int(within) / 1e6 if for_us else 0.0)
 
     def ready(self, status: str) -> None:
-        """The service runs, or has finished reloading. The first call starts the watchdog messages."""
-        self._tell("READY=1", status)
+        """Report that the service runs, or has finished reloading. The first call starts the watchdog messages."""
+        self._notify("READY=1", status)
         if self._beat is None and self._every:
             self._beat = asyncio.get_running_loop().call_later(self._every, self._live)
 
     def reloading(self) -> None:
-        """Its files are read again; `ready` ends that."""
+        """Report that the service reads its files again; `ready` ends that."""
         now = time.clock_gettime_ns(time.CLOCK_MONOTONIC) // 1_000
-        self._tell(f"RELOADING=1\nMONOTONIC_USEC={now}", "reads its files again")
+        self._notify(f"RELOADING=1\nMONOTONIC_USEC={now}", "reloading its files")
 
     def stopping(self, status: str) -> None:
-        """The service ends, and the watchdog messages too."""
+        """Report that the service stops, and end the watchdog messages."""
         if self._beat is not None:
             self._beat.cancel()
-        self._tell("STOPPING=1", status)
+        self._notify("STOPPING=1", status)
 
     def _live(self) -> None:
-        self._tell("WATCHDOG=1")
+        self._notify("WATCHDOG=1")
         self._beat = asyncio.get_running_loop().call_later(self._every, self._live)
 
-    def _tell(self, word: str, status: str = "") -> None:
+    def _notify(self, word: str, status: str = "") -> None:
         if not self._address:
             return
         lines = f"{word}\nSTATUS={' '.join(clean(status).split())}" if status else word
@@ -69,5 +69,5 @@ class ServiceManager:
             self._deaf = False
         except OSError as error:
             if not self._deaf:
-                log.warning("the service manager is not told %s: %s", word.splitlines()[0], error)
+                log.warning("can't send %s to the service manager: %s", word.splitlines()[0], error)
             self._deaf = True

@@ -78,7 +78,7 @@ class ComponentPlacer:
         self._supervisor.call_later(BEGIN, self._requests.open)
 
     def maintain(self, hosts: frozenset[HostName]) -> None:
-        """These hosts are in maintenance now: nothing is placed there, and components leave."""
+        """Set the hosts in maintenance: no component is placed there, and components leave."""
         self._feed(events.Maintained(hosts))
 
     def stop(self) -> None:

@@ -1,4 +1,4 @@
-"""A candidate's copy of the placer's publications. It alone knows the components of a host that died with the
+"""A candidate's copy of the placer's publications: the only record of components on a host that died with the
 leader."""
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ class PlacementLedger:
             self._current.discard(component)
 
     def _on_leader(self, token: Token, alive: bool) -> None:
-        """A late candidate asks for earlier publications."""
+        """Ask a new leader for placements published before this candidate started."""
         if alive and token.host != self.mesh.me.host:
             self._supervisor.spawn(self._catch_up())
 
@@ -71,7 +71,7 @@ class PlacementLedger:
             key = self.mesh.keys.placer(self.mesh.me)
             reply = await self.mesh.ask_one(key, ListPlacements(), Placements, timeout=ASK_TIMEOUT)
             if reply is not None and reply.message is not None:
-                # Meanwhile publications are newer or equal.
+                # Publications received meanwhile are newer or equal.
                 listed = reply.message
                 fresh = [known for known in listed.components if known.component not in self._current]
                 try:

@@ -24,7 +24,7 @@ DEPTH: Final = 4_096  # reports kept unread; the oldest are lost, and later ones
 
 
 class LoadBalancer:
-    """Ranks hosts until stopped or failed; knows load reports alone, so a new leader's knows all within 1 s."""
+    """Ranks hosts until stopped or failed. Load reports are its only state, so a new leader has it all within 1 s."""
 
     def __init__(self, mesh: Mesh, on_failure: Callable[[Exception], object]) -> None:
         self.mesh = mesh

@@ -27,7 +27,7 @@ class NodeClient:
         self.mesh, self._start_timeout = mesh, start_timeout / SECOND + ANSWER_SLACK
 
     async def carry_out(self, command: events.HostCommand) -> events.PlacerEvent | None:
-        """None if a list was not answered."""
+        """Carry out a command; return its result, None for a list without an answer."""
         match command.operation:
             case messages.StartComponent() as start:
                 return await self._start(command.host, start)

@@ -58,7 +58,7 @@ class PlacerRequestHandler:
         self._waiting: dict[PlacerQuery, _Waiting] = {}
 
     def receive(self, query: PlacerQuery) -> None:
-        """Answer it, carry it out, or keep it until `open`. Raises Refused and BadName."""
+        """Answer the query, carry it out, or keep it until `open`. Raises Refused and BadName."""
         operation = query.message
         if isinstance(operation, messages.ListPlacements):
             query.answer(self.placements(operation.component))
@@ -72,7 +72,7 @@ class PlacerRequestHandler:
             self._early.append((query, event))
 
     def _allowed(self, event: Operation, sender: Sender) -> Operation:
-        """The event as permitted to its sender. Raises Refused."""
+        """Check the sender's rights, and set the owner. Raises Refused."""
         if isinstance(event, messages.DrainHost | messages.UncordonHost):
             self._authority.check_operator(sender, f"empty {event.host} or fill it again")
             return event
@@ -125,13 +125,13 @@ class PlacerRequestHandler:
             if status is None:
                 query.refuse(Refused("unknown_component", "there is no component of this name").problem)
             elif isinstance(operation, messages.MigrateComponent) and waiting.host == status.host != operation.to:
-                reason = status.reason or f"it goes on on {status.host}"
+                reason = status.reason or f"it still runs on {status.host}"
                 query.refuse(Refused("move_failed", reason).problem)
             else:
                 query.answer(status)
 
     def placements(self, component: str | None = None, *, host: str | None = None) -> messages.Placements:
-        """All components, or the ones of a name or a host."""
+        """All components, or those with a name or on a host."""
         components = sorted(self._placer.components.items())
         found = [status for name, status in components if component in (None, name) and host in (None, status.host)]
         return messages.Placements(self.term, found, sorted(self._placer.cordoned), maintained=self._placer.maintained)
