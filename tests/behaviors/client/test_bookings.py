@@ -94,7 +94,7 @@ async def test_a_refusal_is_raised_at_once_and_silence_after_the_time_given() ->
 
 
 async def test_an_rcm_that_knows_no_bookings_is_told_as_such() -> None:
-    with pytest.raises(RcmSilent, match="does not tell of bookings; it may be older"):
+    with pytest.raises(RcmSilent, match="did not answer; its version may not support bookings"):
         await BookingsClient(Leader(lambda _: None).client).list()
 
 

@@ -1,12 +1,12 @@
-"""Holds as context managers: `hold` for one, `holds` for one after the other.
+"""Holds as context managers: `hold` for a single hold, `holds` for consecutive holds of a request.
 
     async with Client.connect() as client:
         async for attempt in holds(client, "survey", {"robot/scout33": {}}):
             async with attempt as held:
                 await held.command("robot/scout33", {"name": "echo", "value": 1})
 
-The body begins at the grant. Its devices confirm the grant meanwhile; if one does not within a second, the body is
-cancelled. A command that reaches a device before that waits there for at most its `ttl`."""
+The body begins at the grant, while the devices are still confirming it; if a device does not confirm within a second,
+the body is cancelled. A command that reaches a device before it knows the grant waits there for at most its `ttl`."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ from zscout.types import SECOND, Grant, Ns
 
 log = logging.getLogger(__name__)
 
-UNABLE: Final = ("unknown_command", "bad_command", "warming")
-"""How a device of an older version refuses what it does not know."""
-LOOK_AGAIN: Final = 60.0
-"""Seconds after which pictures are waited for anew."""
+UNKNOWN_TO_OLDER: Final = ("unknown_command", "bad_command", "warming")
+"""Codes with which a device of an older version refuses an unknown command."""
+PICTURE_WAIT: Final = 60.0
+"""Longest wait for a picture, in seconds, before the wait is repeated."""
 
 
 class Revoked(Exception):
@@ -56,9 +56,9 @@ class Held:
         self.arc = arc
         self.grant = grant
         self.rcs: list[str] = list(arc.rcs)
-        """The devices that it holds, sorted."""
+        """The held devices, sorted."""
         self.bound: dict[str, str] = dict(arc.bound)
-        """For each pattern of the needs, the device that satisfies it."""
+        """The device that satisfies each pattern of the needs."""
         self._tracker, self._notices = NoticeTracker(), deque[HoldNotice]()
         self._calling: set[asyncio.Task[None]] = set()
 
@@ -72,7 +72,7 @@ class Held:
         return rc
 
     def now(self) -> Ns:
-        """The time in ns by this host's clock, which counts from its start."""
+        """The time in ns since this host booted."""
         return self._client.mesh.now()
 
     @property
@@ -82,24 +82,24 @@ class Held:
 
     @property
     def remaining(self) -> float:
-        """Seconds left of the minimum runtime: all of it while devices are starting."""
+        """Seconds left of the minimum runtime, which does not run while devices are starting."""
         return (self.arc.end - max(self.now(), self.arc.ready or 0)) / SECOND
 
     @property
     def completed(self) -> bool:
-        """True if the hold ended after its minimum runtime, not before."""
+        """True if the hold ended after its minimum runtime, rather than before."""
         if self.active:
             return not self.arc.keep and self.remaining <= 0 and not self.settling
         return self.arc.outcome == "completed"
 
     @property
     def upcoming(self) -> list[HoldNotice]:
-        """The request that waits, and the booking or maintenance, to which this hold yields next."""
+        """The waiting request, booking or maintenance to which this hold yields next: one notice for each kind."""
         return list(self.arc.upcoming) if self.active else []
 
     async def noticed(self) -> HoldNotice | None:
-        """Wait for the next notice of what the hold yields to; those that are known already come first. None: the hold
-        is over."""
+        """Wait for the next notice of a request, booking or maintenance to which the hold yields. Notices that are
+        known already come first. None: the hold is over."""
         while True:
             self._notices += self._tracker.take(self.upcoming, self.now()) if self.active else []
             if self._notices:
@@ -129,57 +129,56 @@ class Held:
 
     @property
     def settling(self) -> bool:
-        """True while some devices are not ready yet. The runtime begins when they are. (Where a device is of a zscout
-        before 0.3 it passes meanwhile; if none is left then, the request is repeated.)"""
+        """True while some devices are not ready; the minimum runtime begins when all are. (With devices of zscout
+        before 0.3 it runs meanwhile; if none of it is left once they are ready, the request is repeated.)"""
         return self.arc._settling == self.grant or (self.active and self.arc.ready is not None)
 
     async def confirmed(self) -> bool:
-        """Wait until all devices have confirmed the hold, which they do once they are ready. False if the hold
+        """Wait until all devices have confirmed the hold, which they do once they are ready. Return False if the hold
         ended."""
         return self.active and await self._client.internals.confirmed(self.arc) and self.active
 
     async def command(self, need: str, do: Mapping[str, Any], *, ttl: float = 1.0) -> Done:
-        """Have a held device carry out a command, and return its answer: `result` is what the device returned. `need`:
-        the name of the device, or the pattern that it satisfies. A device that is not ready has `ttl` seconds. Raises
-        CommandRefused, and KeyError for a pattern that was not requested."""
+        """Have a held device carry out a command, and return its answer; its `result` is the device's result. `need` is
+        the device's name, or the pattern that it satisfies. If the device is not ready, the command waits for at most
+        `ttl` seconds. Raises CommandRefused, and KeyError for a pattern that was not requested."""
         rc = self.rc(need) if is_pattern(need) else need
         return await self._client.command(rc, self.grant, do, ttl=ttl)
 
     async def expect_outage(self, seconds: float, *, each: bool = False) -> dict[str, float]:
-        """Announce that devices will not work for a while, as when a test reboots them: they are not lost in that time.
-        With `each` this holds for every outage under this hold. Return by device how many seconds it tolerates: at most
-        its `tolerate_max`; 0 for a device that cannot. Raises CommandRefused."""
+        """Announce an outage of the held devices of up to `seconds`, for example before a test reboots them: it does
+        not end the hold. With `each`, this applies to every outage under this hold. Return by device how many seconds
+        it tolerates: at most its `tolerate_max`, 0 if it does not support that. Raises CommandRefused."""
         check_seconds("seconds", seconds)
         do = {"name": "expect_outage", "seconds": float(seconds), "each": each}
         tolerated = await asyncio.gather(*(self._announce(rc, do) for rc in self.rcs))
         return dict(zip(self.rcs, tolerated, strict=True))
 
     async def report_broken(self, reason: str, *needs: str) -> None:
-        """Report devices of this hold broken (default: all), with a reason for people. Once the hold has ended they are
-        granted to operators only, until somebody runs `zscout maintain DEVICE --well`. Raises RequestRefused, KeyError
-        for what this hold does not have, ValueError for a bad reason."""
+        """Report devices of this hold broken (default: all), with a reason for people. After the hold they are granted
+        to operators only, until `zscout maintain DEVICE --well`. Raises RequestRefused; KeyError for a need that was
+        not requested; ValueError for a reason that is too long."""
         await BookingsClient(self._client).report_broken([self.rc(need) for need in needs] or self.rcs, reason)
 
     async def _announce(self, rc: str, do: Mapping[str, Any]) -> float:
         try:
             done = await self._client.command(rc, self.grant, do)
         except CommandRefused as refused:
-            if refused.code not in UNABLE:
+            if refused.code not in UNKNOWN_TO_OLDER:
                 raise
             return 0.0
         known = done.result.get("seconds") if isinstance(done.result, dict) else None
         return float(known) if isinstance(known, int | float) else 0.0
 
     async def frames(self, need: str) -> AsyncGenerator[Frame, None]:
-        """Yield the pictures of a held framegrabber as they come, until the hold is over: each time the newest, so that
-        who is slow misses some. Those of another hold are left out. Raises KeyError for a pattern that was not
-        requested."""
+        """Yield the newest picture of a held framegrabber, again and again until the hold is over; a slow program
+        misses some. Pictures of other holds are left out. Raises KeyError for a need that was not requested."""
         mesh, rc = self._client.mesh, self.rc(need)
         over = asyncio.create_task(self.over())
         try:
             with closing(mesh.frames(mesh.keys.frame(rc))) as watch:
                 while not over.done():
-                    coming = asyncio.create_task(watch.next(LOOK_AGAIN))
+                    coming = asyncio.create_task(watch.next(PICTURE_WAIT))
                     try:
                         await asyncio.wait((coming, over), return_when=asyncio.FIRST_COMPLETED)
                     finally:
@@ -194,21 +193,21 @@ class Held:
 
     @property
     def _words(self) -> str:
-        """The request, the devices, and how long they are held or why no longer."""
+        """The request, its devices, and the time left, or why the hold ended."""
         if self.active and not self.completed:
-            stands = f"{self.remaining:.0f} s left" if self.remaining > 0 else kept(self.arc.priority)
+            status = f"{self.remaining:.0f} s left" if self.remaining > 0 else kept(self.arc.priority)
         else:
             ending = None if self.active else self.arc._ending
-            stands = f"over: {ending.reason or ending.outcome}" if ending is not None else "over"
-        return f"{self.arc.name}: {', '.join(self.rcs)}; {stands}"
+            status = f"over: {ending.reason or ending.outcome}" if ending is not None else "over"
+        return f"{self.arc.name}: {', '.join(self.rcs)}; {status}"
 
     async def resumed(self) -> None:
-        """Wait while the program is being moved to another host. Returns at once otherwise."""
+        """Wait while the program is being moved to another host."""
         await self._client.internals.resumed()
 
     async def over(self) -> None:
-        """Wait until the hold is over: for bodies whose work runs elsewhere."""
-        # A timer may go off a little before its time by this host's clock.
+        """Wait until the hold is over, for bodies whose work runs elsewhere."""
+        # A timer may fire a little early by this host's clock.
         while self.active and not self.completed:
             with suppress(TimeoutError):
                 async with asyncio.timeout(None if self.arc.keep or self.settling else self.remaining):
@@ -216,8 +215,9 @@ class Held:
 
 
 class Attempt:
-    """One entry into an ARC's body, or one after the other: `again` lets a hold that was taken away be waited for
-    once more, and one that was kept and had its time be asked for anew. `timeout` in seconds, for each wait."""
+    """The context manager of a body under a hold. With `again` it can be entered repeatedly: after a hold was taken
+    away it waits for the next, and after a hold was kept for its minimum runtime it makes a new request. `timeout`:
+    seconds, for each wait."""
 
     def __init__(
         self,
@@ -234,28 +234,27 @@ class Attempt:
         self._client, self._ask, self._again, self._timeout = client, ask, again, timeout
         self._confirmed = confirmed
         self.arc: OpenArc | None = None
-        self._anew = False
-        """Whether what was kept is to be asked for anew."""
+        self._needs_new_request = False
+        """True if the next entry must make a new request."""
         self._entered: tuple[Held, asyncio.Task[Any], asyncio.Task[None], DirectHold | None] | None = None
-        """The hold, its body, what cancels the body when the hold is over, and what a direct one owes its RCs."""
+        """The hold, its body, the task that cancels the body at the end of the hold, and the direct hold, if any."""
         self._cancelled = 0
-        """How often the body was, for that."""
+        """How often the body was cancelled for that."""
 
     @property
     def goes_on(self) -> bool:
-        """Whether its ARC is to be waited for once more."""
-        return self._anew or (self.arc is not None and self.arc.open)
+        """True if it can be entered again."""
+        return self._needs_new_request or (self.arc is not None and self.arc.open)
 
     async def asked(self) -> OpenArc:
-        """The request, made now where it was not yet, for who wants to know of it while it waits. Raises
-        RequestRefused."""
-        if self._anew or self.arc is None:
-            self.arc, self._anew = None, False
+        """Return the request, made now unless it was before. Raises RequestRefused."""
+        if self._needs_new_request or self.arc is None:
+            self.arc, self._needs_new_request = None, False
             self.arc = await self._client.request(**self._ask)
         return self.arc
 
     async def granted(self) -> Held:
-        """Waits for the grant, requested where it was not yet. Raises Revoked, RequestRefused, TimeoutError."""
+        """Wait for the grant, after making the request if needed. Raises Revoked, RequestRefused, TimeoutError."""
         try:
             async with asyncio.timeout(self._timeout):
                 grant = await self._client.granted(await self.asked(), confirmed=self._confirmed)
@@ -266,7 +265,7 @@ class Attempt:
             if isinstance(error, asyncio.CancelledError):
                 raise
             raise TimeoutError(f"{self._ask['name']} was not granted within {self._timeout:g} s: {why}") from None
-        assert self.arc is not None  # noqa: S101 - it was asked for
+        assert self.arc is not None  # noqa: S101 - `asked` has set it
         if grant is None:
             raise Revoked(self.arc)
         return Held(self._client, self.arc, grant)
@@ -285,7 +284,7 @@ class Attempt:
         if direct is not None:
             direct.end()
             if held.active:
-                # By our clock it had its time. An RCM that takes the lead as it clears up would queue it again.
+                # Its time is over by this host's clock. A new leader during the cleanup would queue it again.
                 self._client.internals.expire(held.arc)
             await asyncio.sleep(max(0, direct.gone_by - held.now()) / SECOND)
             log.warning("%s cleans up too long after its hold; interrupting it, the next holder begins", held.arc.name)
@@ -302,16 +301,16 @@ class Attempt:
         watch.cancel()
         if direct is not None:
             direct.returned()
-        # As asyncio.timeout does it: a cancellation from outside that came as well is not swallowed.
+        # Like asyncio.timeout, don't swallow an additional cancellation from outside.
         left = [body.uncancel() for _ in range(self._cancelled)]
         interrupted = left[-1:] == [0] and kind is asyncio.CancelledError
         if held.completed:
-            # What somebody released is not to be had again.
+            # Don't request again a hold that was released by hand.
             by_hand = arc.why is not None and arc.why.code == "released"
-            self._anew = self._again and interrupted and arc.keep and not by_hand
+            self._needs_new_request = self._again and interrupted and arc.keep and not by_hand
             self._client.internals.complete(arc)
             return interrupted
-        # Whose body was interrupted is over for it, though a new RCM may have found that it stands all the same.
+        # A hold whose body was interrupted has ended for it, even if a new RCM meanwhile continues the hold.
         if not interrupted and (held.active or kind is not None):
             if arc.open:
                 await self._client.end(arc)
@@ -328,7 +327,7 @@ _ASKED = ("name", "needs", "priority", "min_runtime", "keep", "direct", "comment
 
 
 def _ask(*values: Any) -> dict[str, Any]:
-    """What `Client.request` is given."""
+    """Return the arguments for `Client.request`."""
     return dict(zip(_ASKED, values, strict=True))
 
 
@@ -347,17 +346,17 @@ def hold(
     wait_for_device: bool | None = None,
     booking: str = "",
 ) -> Attempt:
-    """Hold devices for the body of an `async with`, which gives a `Held`.
+    """Hold devices for the body of an `async with`, whose target is a `Held`.
 
     Entering waits for the grant. The body is cancelled when the hold ends: after its minimum runtime the `async with`
-    then ends normally and `held.completed` is true; before it, the `async with` raises Revoked.
+    then ends normally, with `held.completed` true; before it, the `async with` raises Revoked.
 
-    Takes what `Client.request` takes, and:
+    Takes the arguments of `Client.request`, and:
 
-    - `confirmed`: enter when all devices have confirmed the grant, instead of at the grant.
-    - `direct`: the body also reaches its devices past zscout. It is entered when all devices have confirmed the grant.
-      When the hold ends, `finally` and `except CancelledError` have nine tenths of the devices' `settle` to clean up;
-      the next holder waits for that.
+    - `confirmed`: enter once all devices have confirmed the grant, instead of at the grant.
+    - `direct`: the body also reaches its devices past zscout. It is entered once all devices have confirmed the grant.
+      When the hold ends, `finally` and `except CancelledError` have nine tenths of the devices' `settle` to clean up,
+      for which the next holder waits.
     - `timeout`: seconds to wait for the grant. Entering raises TimeoutError after that, and the request is cancelled.
 
     Entering also raises RequestRefused and Revoked."""
@@ -381,9 +380,9 @@ async def holds(
     estimate: bool = False,
     continues: str = "",
 ) -> AsyncIterator[Attempt]:
-    """Hold devices again and again: yields a `hold` to enter, and another whenever that ended for other requests. Ends
-    after a body that ended by itself, and with `keep=False` after the minimum runtime. `estimate` and `continues` are
-    those of `Client.request`."""
+    """Hold devices repeatedly: yield a `hold` to enter, and another whenever the hold was taken away. Ends after a body
+    that ended by itself, and with `keep=False` after the minimum runtime. Takes the arguments of `hold` without
+    `timeout`, and `estimate` and `continues` of `Client.request`."""
     ask = _ask(name, needs, priority, min_runtime, keep, direct, comment, wait_for_device, booking)
     ask |= {"estimate": estimate, "continues": continues}
     attempt = Attempt(client, ask, again=True, confirmed=confirmed)

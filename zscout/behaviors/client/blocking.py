@@ -1,14 +1,16 @@
-"""The synchronous form, for scripts and notebooks.
+"""The synchronous client, for scripts and notebooks.
 
     with zscout.connect() as lab, lab.hold("survey", {"robot/scout33": {}}) as held:
         held.command("robot/scout33", {"name": "echo", "value": 1})
 
 At the end of the hold a signal (`interruption.py`) raises `Revoked` in the body: only in the main thread, while the
 body's function is on the stack, and not while a call of a C library ignores signals. Elsewhere the next use of `held`
-raises it. Devices obey nothing under a hold that is over, whatever the body does.
+raises it. After the hold, devices refuse all its commands.
 
-    held = lab.acquire("survey", {"robot/scout33": {}})  # in one cell of a notebook
-    held.release()  # in another"""
+In a notebook, acquire in one cell and release in another:
+
+    held = lab.acquire("survey", {"robot/scout33": {}})
+    held.release()"""
 
 from __future__ import annotations
 
@@ -43,7 +45,7 @@ log = logging.getLogger(__name__)
 CLOSED: Final = "this lab is closed; zscout.connect() gives a new one"
 FORKED: Final = f"this lab belongs to the parent of this forked process; join the mesh in a new process: {SPAWN}"
 LAST_STEPS: Final = 1.0
-"""Seconds in which what still runs in the loop hears that its lab is closed."""
+"""Seconds for which a closing lab waits for the tasks that it cancels."""
 
 
 class BlockingHeld:
@@ -54,12 +56,12 @@ class BlockingHeld:
         self._body = InterruptibleBody(self._revoked)
         self._raised = False
         self._ending: HoldEnd | None = None
-        """How it was taken away."""
+        """How the hold ended, if it was taken away."""
         self._watches: set[asyncio.Task[None]] = set()
 
     @property
     def grant(self) -> Grant:
-        """The number under which the devices know the hold."""
+        """Identifies the hold to its devices."""
         return self._held.grant
 
     @property
@@ -69,27 +71,27 @@ class BlockingHeld:
 
     @property
     def completed(self) -> bool:
-        """True if the hold ended after its minimum runtime, not before."""
+        """True if the hold ended after its minimum runtime, rather than before."""
         return self._held.completed
 
     @property
     def lost(self) -> bool:
-        """True once the hold is over, for whatever reason."""
+        """True once the hold is over, for any reason."""
         return not self.active
 
     def on_lost(self, callback: Callable[[], object]) -> None:
-        """Call `callback` in a thread of zscout's once the hold is over; at once if it is. What takes long there delays
-        other holds of this lab."""
+        """Call `callback` in zscout's thread once the hold is over; at once if it is. A slow callback delays other
+        holds of this lab."""
         self._lab.run(self._call_when_over(callback))
 
     @property
     def upcoming(self) -> list[HoldNotice]:
-        """The request that waits, and the booking or maintenance, to which this hold yields next."""
+        """The waiting request, booking or maintenance to which this hold yields next: one notice for each kind."""
         return self._held.upcoming
 
     def on_notice(self, callback: Callable[[HoldNotice], object]) -> None:
-        """Call `callback` in a thread of zscout's with each notice of what the hold yields to: at once with those that
-        are known. A slow callback delays other holds of this lab."""
+        """Call `callback` in zscout's thread with each notice of a request, booking or maintenance to which the hold
+        yields: at once for notices that are known. A slow callback delays other holds of this lab."""
         self._lab.run(self._call_when_noticed(callback))
 
     async def noticed(self) -> HoldNotice | None:
@@ -106,16 +108,16 @@ class BlockingHeld:
             self._body.waits = False
 
     def release(self) -> None:
-        """Give the devices back. Does nothing for a hold that is over, or that was given back."""
+        """Give the devices back. Does nothing once the hold is over."""
         self._attempt._leave()
 
     @property
     def remaining(self) -> float:
-        """Seconds left of the minimum runtime, in which only a higher priority preempts the hold."""
+        """Seconds left of the minimum runtime, in which only a request of higher priority preempts the hold."""
         return self._held.remaining
 
     def check(self) -> None:
-        """Raise Revoked once the hold is over, and RuntimeError in a fork."""
+        """Raise Revoked if the hold is over, and RuntimeError in a forked process."""
         if self._lab.forked:
             raise RuntimeError(FORKED)
         if not self.active:
@@ -123,7 +125,7 @@ class BlockingHeld:
             raise self._revoked()
 
     def wait(self, timeout: float | None = None) -> bool:
-        """Wait until the hold is over, at most `timeout` seconds. Return True if it is; nothing is raised then."""
+        """Wait until the hold is over, at most `timeout` seconds; return True if it is. Does not raise Revoked."""
         self._body.waits = True
         try:
             over = self._lab.run(self._over_within(timeout))
@@ -134,7 +136,7 @@ class BlockingHeld:
 
     @property
     def rcs(self) -> list[str]:
-        """All devices that it holds, sorted."""
+        """The held devices, sorted."""
         return list(self._held.rcs)
 
     def rc(self, need: str) -> str:
@@ -143,29 +145,29 @@ class BlockingHeld:
         return self._held.rc(need)
 
     def command(self, need: str, do: Mapping[str, Any], *, ttl: float = 1.0) -> Any:
-        """Have a held device carry out a command, and return its result. `need`: the name of the device, or the pattern
-        that it satisfies. A device that is not ready has `ttl` seconds. Raises CommandRefused, KeyError for a pattern
-        that was not requested, and once Revoked if the hold is over."""
+        """Have a held device carry out a command, and return its result. `need` is the device's name, or the pattern
+        that it satisfies. If the device is not ready, the command waits for at most `ttl` seconds. Raises
+        CommandRefused; KeyError for a pattern that was not requested; Revoked, at the first use after the hold is
+        over."""
         if not self._raised and not self._lab.closed:
             self.check()
         return self._lab.run(self._held.command(need, do, ttl=ttl)).result
 
     def expect_outage(self, seconds: float, *, each: bool = False) -> dict[str, float]:
-        """Announce that devices will not work for a while, as when a test reboots them: they are not lost in that time.
-        With `each` this holds for every outage under this hold. Return by device how many seconds it tolerates: at most
-        its `tolerate_max`; 0 for a device that cannot. Raises CommandRefused."""
+        """Announce an outage of the held devices of up to `seconds`, for example before a test reboots them: it does
+        not end the hold. With `each`, this applies to every outage under this hold. Return by device how many seconds
+        it tolerates: at most its `tolerate_max`, 0 if it does not support that. Raises CommandRefused."""
         return self._lab.run(self._held.expect_outage(seconds, each=each))
 
     def report_broken(self, reason: str, *needs: str) -> None:
-        """Report devices of this hold broken (default: all), with a reason for people. Once the hold has ended they are
-        granted to operators only, until somebody runs `zscout maintain DEVICE --well`. Raises RequestRefused, KeyError
-        for what this hold does not have, ValueError for a bad reason."""
+        """Report devices of this hold broken (default: all), with a reason for people. After the hold they are granted
+        to operators only, until `zscout maintain DEVICE --well`. Raises RequestRefused; KeyError for a need that was
+        not requested; ValueError for a reason that is too long."""
         self._lab.run(self._held.report_broken(reason, *needs))
 
     def frames(self, need: str) -> Iterator[Frame]:
-        """Yield the pictures of a held framegrabber as they come, until the hold is over: each time the newest, so that
-        who is slow misses some. Those of another hold are left out. Raises KeyError for a pattern that was not
-        requested."""
+        """Yield the newest picture of a held framegrabber, again and again until the hold is over; a slow program
+        misses some. Pictures of other holds are left out. Raises KeyError for a need that was not requested."""
         frames = self._held.frames(need)
         try:
             while (frame := self._lab.run(_next(frames))) is not None:
@@ -205,7 +207,7 @@ async def _close(frames: AsyncGenerator[Frame, None]) -> None:
 
 
 class BlockingAttempt(AbstractContextManager[BlockingHeld, None]):
-    """What `Lab.hold` gives: waits for the grant when it is entered, and gives back when it is left."""
+    """The result of `Lab.hold`: entering it waits for the grant, leaving it gives the devices back."""
 
     def __init__(self, lab: Lab, attempt: Attempt, *, interrupt: bool) -> None:
         self._lab, self._attempt, self._interrupt = lab, attempt, interrupt
@@ -285,7 +287,7 @@ class BlockingAttempt(AbstractContextManager[BlockingHeld, None]):
         if self._watch is not None:
             self._watch.cancel()
         if self._entering is not None and not self._entering.done():
-            # It was interrupted, and withdraws what it asked for.
+            # Entering was interrupted: wait until it has withdrawn its request.
             await asyncio.wait([self._entering])
         arc, client = self._attempt.arc, self._lab.client
         if self._held is not None and (direct := client.internals.direct_hold(self._held.grant)) is not None:
@@ -321,17 +323,18 @@ class Lab:
 
     @property
     def forked(self) -> bool:
-        """True in a fork of the process that connected: it has neither the thread nor the connection."""
+        """True in a forked process, which has neither the thread nor the connection."""
         return self._process != os.getpid()
 
     @property
     def closed(self) -> bool:
-        """True once it was closed. Also true in a fork of the process."""
+        """True once the lab was closed, and in a forked process."""
         return self._stopped or self.forked
 
     def submit(self, coroutine: Coroutine[Any, Any, T]) -> futures.Future[T]:
-        """Run a coroutine in the client's event loop. Raises RuntimeError if the lab is closed, or in a fork."""
-        if self.forked:  # another thread may have had the lock
+        """Run a coroutine in the client's event loop. Raises RuntimeError if the lab is closed, or in a forked
+        process."""
+        if self.forked:  # without the lock, which another thread may have held at the fork
             coroutine.close()
             raise RuntimeError(FORKED)
         with self._asking:
@@ -377,25 +380,25 @@ class Lab:
         wait_for_device: bool | None = None,
         booking: str = "",
     ) -> AbstractContextManager[BlockingHeld, None]:
-        """Hold devices for the body of a `with`, which gives a `BlockingHeld`.
+        """Hold devices for the body of a `with`, whose target is a `BlockingHeld`.
 
         Entering waits for all of `needs`, at most `timeout` seconds; leaving gives them back. The hold is protected for
         `min_runtime` seconds (default: the fleet's, 60), and continues until a request of equal or higher priority
         waits for one of its devices. With `keep=False` it ends after `min_runtime`.
 
-        When the hold ends, Revoked is raised in a body in the main thread, whatever it is doing; its `outcome` is
-        `completed` after the minimum runtime. In other threads, in a body that is suspended (of a generator or a
-        coroutine), and with `interrupt=False`, the next command raises it, or `held.check()`.
+        When the hold ends, Revoked is raised in a body in the main thread, even if it blocks; its `outcome` is
+        `completed` after the minimum runtime. In other threads, in a suspended body (of a generator or coroutine), and
+        with `interrupt=False`, the next command or `held.check()` raises it.
 
-        - `confirmed`: enter when all devices have confirmed the grant, instead of at the grant.
+        - `confirmed`: enter once all devices have confirmed the grant, instead of at the grant.
         - `direct`: the body also reaches its devices past zscout. After the end of the hold it has nine tenths of the
-          devices' `settle` to clean up, then Revoked is raised once more; the next holder waits for that.
+          devices' `settle` to clean up, for which the next holder waits; then Revoked is raised again.
         - `comment`: shown to other people.
         - `wait_for_device`: wait for an unknown device instead of raising RequestRefused.
         - `booking`: the id of a booking to take up. The request has its needs and priority, and waits for its next
           date.
 
-        Entering raises TimeoutError, RequestRefused, Revoked if somebody ended the request, and NoRcm if no leader is
+        Entering raises TimeoutError; RequestRefused; Revoked if the request was ended elsewhere; NoRcm if no leader is
         visible within 3 s. Leaving raises Revoked if the hold was taken away and the body was not interrupted."""
         how: dict[str, Any] = {"priority": priority, "min_runtime": min_runtime, "keep": keep, "timeout": timeout}
         how |= {"comment": comment, "direct": direct, "confirmed": confirmed, "wait_for_device": wait_for_device}
@@ -403,15 +406,15 @@ class Lab:
         return BlockingAttempt(self, hold(self.client, name, needs, **how), interrupt=interrupt)
 
     def acquire(self, name: str, needs: Needs, **how: Any) -> BlockingHeld:
-        """Hold devices until `release()`, across functions or cells of a notebook. Takes what `hold` takes, and raises
-        what entering that does. Nothing is interrupted at the end of the hold: `held.lost` tells, `held.on_lost` calls
-        back, and the next command raises Revoked. `close`, and the end of this process, give the devices back."""
+        """Hold devices until `release()`, across functions or cells of a notebook. Arguments and errors are those of
+        `hold`. The end of the hold interrupts nothing: `held.lost` becomes true, callbacks of `held.on_lost` are
+        called, and the next command raises Revoked. `close`, and the end of this process, give the devices back."""
         attempt = self.hold(name, needs, **how, interrupt=False)
         return attempt.__enter__()
 
     def status(self) -> LabStatus:
-        """Return the devices of the fleet with their holders, and the requests that wait. Printed it is a table, in a
-        notebook one to look at. Raises NoRcm."""
+        """Return the devices of the fleet with their holders, and the waiting requests. It prints as a table, and shows
+        as one in a notebook. Raises NoRcm."""
         return self.run(self._status())
 
     async def _status(self) -> LabStatus:
@@ -438,7 +441,7 @@ class Lab:
         self._loop.close()
 
     async def _cancel_rest(self) -> None:
-        """Other threads may wait for something here."""
+        """Cancel all tasks, for whose results other threads may wait."""
         rest = asyncio.all_tasks() - {asyncio.current_task()}
         for task in rest:
             task.cancel()

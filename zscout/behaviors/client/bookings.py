@@ -1,4 +1,4 @@
-"""Bookings from a program: devices together, from a date on.
+"""Bookings from a program: devices together, from a given time on.
 
     async with zscout.Client.connect() as client:
         bookings = zscout.BookingsClient(client)
@@ -8,7 +8,7 @@
         async with zscout.hold(client, "survey", **bookings.terms(booking)) as held:
             ...
 
-From plain code: `lab.run(bookings.book(...))`, with `zscout.BookingsClient(lab.client)`.
+Without asyncio: `lab.run(bookings.book(...))`, with `bookings = zscout.BookingsClient(lab.client)`.
 """
 
 from __future__ import annotations
@@ -46,20 +46,20 @@ from zscout.messages import (
 from zscout.types import SECOND
 
 ANSWER: Final = 5.0
-"""Seconds of one question: before a booking is told, another host has it on its disk."""
+"""Seconds of one query: a booking is stored on a second host's disk before the answer."""
 TIMEOUT: Final = 15.0
-"""Seconds within which some RCM answers, though the lead changes meanwhile."""
+"""Seconds within which some RCM answers, even if the leader changes meanwhile."""
 PATIENCE: Final = 900.0
-"""Seconds after its date in which a booking can be taken up, by default."""
+"""Default time in seconds after its date in which a booking can be taken up."""
 
 MAX_NAMED: Final = 60
-"""Characters of a default name: a number may follow."""
+"""Most characters of a default name, to which a number may be added."""
 
 M = TypeVar("M", bound=Message)
 
 
 class RcmSilent(RequestRefused):
-    """No leader answered; the operation may or may not have been done."""
+    """No leader answered; the operation may or may not have been carried out."""
 
 
 class BookingsClient:
@@ -69,10 +69,10 @@ class BookingsClient:
         self._client, self._mesh, self._timeout = client, client.mesh, timeout
 
     async def list(self, *, owner: str | None = None, rc: str | None = None) -> BookingsTold:
-        """Return the bookings that are not over, all or those of `owner` (a host or a person) or that may use the
-        device `rc`, and the fleet's time. Raises RequestRefused; RcmSilent if no leader answers."""
-        question, silent = BookingsAsk(owner=owner, rc=rc), "does not tell of bookings; it may be older than these"
-        return await self._until_told(
+        """Return the bookings that are not over, and the fleet's time. `owner` (a host or a person) and `rc` (a device
+        that the booking may use) restrict them. Raises RequestRefused; RcmSilent if no leader answers."""
+        question, silent = BookingsAsk(owner=owner, rc=rc), "did not answer; its version may not support bookings"
+        return await self._ask_until_answered(
             self._mesh.keys.ask_bookings(self._mesh.me), question, BookingsTold, ANSWER, silent
         )
 
@@ -93,20 +93,19 @@ class BookingsClient:
         broken: bool = False,
         comment: str = "",
     ) -> BookingView:
-        """Book all of `needs` together, from `start` on for `runtime` seconds. Return when a second host has stored
-        the booking.
+        """Book all of `needs` together, for `runtime` seconds from `start`. Return once a second host has stored the
+        booking.
 
-        The booking lapses `patience` seconds after its start if no request has taken it up (default: 15 min, or
-        its whole time if that is shorter). A request takes it up with its `terms`.
+        The booking lapses `patience` seconds after its start if no request has taken it up (default: 15 min, or its
+        whole time if that is shorter). A request takes it up with its `terms`.
 
-        - `every`: repeat it every so many days, at the same hour in the zone of `start`, whose zone must be a
-          `ZoneInfo`.
+        - `every`: repeat it after so many days, at the same local time; the zone of `start` must be a `ZoneInfo`.
         - `until`: repeat it no later than this, at most a year from now.
         - `maintenance`: keep the devices free of holders. A pattern means all devices that match it, and `@anvil` all
           devices of the host anvil, which gets no components meanwhile. Needs the rights of an operator.
         - `urgent`: maintenance also ends holds within their minimum runtimes.
-        - `lasting`: maintenance until it is cancelled; `runtime` is 60 days, and the leader puts its end off.
-        - `broken`: lasting maintenance that ends no hold and that operators' requests disregard: see `report_broken`.
+        - `lasting`: maintenance until it is cancelled; `runtime` must be 60 days, and the leader extends it.
+        - `broken`: lasting maintenance that ends no hold, and does not bind operators; see `report_broken`.
 
         Raises RequestRefused, with `code` `not_free` if a device is taken; RcmSilent if no leader answers;
         ValueError for a bad date or span of time."""
@@ -137,16 +136,17 @@ class BookingsClient:
         )
 
     async def report_broken(self, rcs: Collection[str], reason: str) -> BookingView:
-        """Report devices broken: they are granted to operators only, until the returned booking is cancelled. Holds go
-        on. In a secured fleet an operator may report any device, others those that they hold. A device that is reported
-        already stays so. Raises RequestRefused, RcmSilent, ValueError for a bad reason."""
-        told = await self.list()
-        for booking in told.bookings:
+        """Report devices broken: they are granted to operators only, until the returned booking is cancelled. Holds
+        continue. In a secured fleet operators may report any device, others only devices that they hold. If all are
+        reported already, that booking is returned. Raises RequestRefused, RcmSilent; ValueError for a reason that is
+        too long."""
+        known = await self.list()
+        for booking in known.bookings:
             if booking.broken and {*rcs} <= {*booking.needs, *booking.maintained} and not booking.unbooked:
                 return booking
         return await self.book(
             {rc: {} for rc in rcs},
-            datetime.fromtimestamp(int(told.time), UTC),
+            datetime.fromtimestamp(int(known.time), UTC),
             WINDOW,
             name=valid_name(f"broken-{'-'.join(min(rcs).split('/'))}")[:MAX_NAMED],
             maintenance=True,
@@ -156,8 +156,8 @@ class BookingsClient:
         )
 
     async def unbook(self, booking: str, start: datetime | int | None = None) -> BookingView:
-        """Cancel the booking with this id, or only the date of its series that begins at `start`. A request that has
-        taken it up continues. Raises RequestRefused, RcmSilent."""
+        """Cancel the booking with this id, or only its date that begins at `start` (a datetime, or Unix seconds). A
+        request that has taken it up continues. Raises RequestRefused, RcmSilent."""
         at = _whole_second(start) if isinstance(start, datetime) else start
         return await self.ask(Unbook(booking, at, self._client.who), BookingView)
 
@@ -191,8 +191,8 @@ class BookingsClient:
 
     @staticmethod
     def terms(booking: BookingView) -> dict[str, Any]:
-        """Return the arguments with which a request takes up a booking: `zscout.hold(client, "survey",
-        **bookings.terms(booking))`."""
+        """Return the arguments with which a request takes up a booking:
+        `zscout.hold(client, "survey", **bookings.terms(booking))`."""
         return {
             "needs": booking.needs,
             "priority": booking.priority,
@@ -206,14 +206,14 @@ class BookingsClient:
         if keys.closed and (why := self._client.fleet.access.refusal(me.host, "book", USERS)):
             raise RequestRefused(Problem("not_allowed", why))
         silent = "did not answer; it may or may not have been done: see zscout booking list, and try again"
-        return await self._until_told(keys.schedule(me), operation, kind, self._timeout, silent)
+        return await self._ask_until_answered(keys.schedule(me), operation, kind, self._timeout, silent)
 
-    async def _until_told(self, key: str, question: Message, kind: type[M], within: float, silent: str) -> M:
+    async def _ask_until_answered(self, key: str, question: Message, kind: type[M], within: float, silent: str) -> M:
         deadline = self._mesh.now() + round(min(within, self._timeout) * SECOND)
         pause, longest = BACKOFF
         problem: Problem | None = None
         while True:
-            replies = await self._mesh.ask(key, question, kind, timeout=ANSWER, enough=_is_told)
+            replies = await self._mesh.ask(key, question, kind, timeout=ANSWER, enough=_is_answer)
             for reply in replies:
                 if reply.message is not None:
                     return reply.message
@@ -233,19 +233,19 @@ class BookingsClient:
         return replace(who or Who(), comment=checked_comment(comment)) if comment else who
 
 
-def _is_told(reply: Reply[Any]) -> bool:
+def _is_answer(reply: Reply[Any]) -> bool:
     return reply.message is not None
 
 
 def _whole_second(at: datetime) -> int:
-    """Raises ValueError for a time of no zone."""
+    """Return Unix seconds. Raises ValueError for a time without a zone."""
     if at.tzinfo is None:
         raise ValueError(f"{at} has no zone; write one: datetime(..., tzinfo=ZoneInfo('Europe/Berlin'))")
     return round(at.timestamp())
 
 
 def _zone(start: datetime, every: int) -> str:
-    """Raises ValueError where it has to have a name, and has none."""
+    """Return the name of a time's zone. Raises ValueError if a repeated booking has no named zone."""
     if isinstance(start.tzinfo, ZoneInfo):
         return start.tzinfo.key
     if every and start.utcoffset() != timedelta(0):

@@ -265,7 +265,7 @@ class Client:
         wait_for_device: bool | None = None,
     ) -> Foresight | None:
         """Return the consequences that a request would have, without making it (a dry run). None if no leader answered.
-        The arguments are those of `request`. Raises RequestRefused."""
+        Takes the arguments of `request`. Raises RequestRefused."""
         if self.mesh.keys.closed and (why := self.fleet.access.refusal(self.mesh.me.host, "request devices", USERS)):
             raise RequestRefused(Problem("not_allowed", why))
         seconds = self._protected(min_runtime)

@@ -6,7 +6,7 @@ lease after the last confirmation was *sent* that all RCs have answered (`sure_u
 publishes. After any end but the client's own release, the program has less than `settle` to end. The client sends
 `leaving` to the RCs at such an end, and `left` once the program is gone.
 
-All times are those of `Mesh.now`: whole ns of CLOCK_BOOTTIME, which all processes of a host share."""
+All times are in ns by `Mesh.now`: CLOCK_BOOTTIME, which all processes of a host share."""
 
 from __future__ import annotations
 

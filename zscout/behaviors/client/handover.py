@@ -36,7 +36,7 @@ CLAIM_TIMEOUT = 10.0
 
 
 class MovableClient:
-    """The base of a client that can hand over its requests, and receive those of another client."""
+    """The base of a client that can hand over its requests, and receive another client's."""
 
     def __init__(self, mesh: Mesh, fleet: Fleet, supervisor: Supervisor) -> None:
         self.mesh, self.fleet, self.supervisor = mesh, fleet, supervisor

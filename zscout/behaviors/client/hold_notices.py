@@ -1,4 +1,4 @@
-"""Notices to the holder: which request, booking or maintenance its hold yields to next. Pure; times in ns on this
+"""Notices to a holder of the request, booking or maintenance to which its hold yields next. Pure; times in ns on this
 host's clock."""
 
 from __future__ import annotations
@@ -11,24 +11,25 @@ from zscout.scheduling.reason import named
 from zscout.types import SECOND, Ns, clean
 
 WITHDRAWN_AFTER: Final[Ns] = 3 * SECOND // 2
-"""A new leader may learn of the waiting requests a little after it has answered the holder."""
+"""Nanoseconds without a notice after which it counts as withdrawn: a new leader may answer the holder before it has
+learned of all waiting requests."""
 SAME: Final[Ns] = 2 * SECOND
-"""A smaller change of a time is not reported."""
+"""Smallest change of a time that is reported, in ns."""
 
 
 class HoldNotice(NamedTuple):
-    """A request waits for devices of a hold (`code` is `waits`), or they are booked (`booked`) or kept for maintenance
-    (`maintenance`): the hold yields to that. `withdrawn`: no longer."""
+    """A hold yields to a waiting request (`code` is `waits`), a booking (`booked`) or maintenance (`maintenance`) of
+    some of its devices; with `withdrawn`, it no longer does."""
 
     code: str
     by: ReasonParty
     """The request or booking, with its name (`arc`), priority and person (`who`)."""
     rcs: list[str]
-    """The devices of the hold that it is about."""
+    """The devices of the hold that are concerned."""
     safe_until: Ns
-    """The hold does not end for it before, by the clock of `held.now()`. In the past: it may end at any time."""
+    """Time by the clock of `held.now()` until which the hold is safe from it; in the past, it may end at any time."""
     begins: Ns | None = None
-    """The date of a booking or maintenance, by the same clock."""
+    """Start of a booking or maintenance, by the same clock."""
     withdrawn: bool = False
 
     @classmethod
@@ -37,13 +38,14 @@ class HoldNotice(NamedTuple):
         return cls(end.code, end.by, end.rcs, now + round(end.safe * SECOND), begins)
 
     def is_like(self, other: HoldNotice, now: Ns) -> bool:
-        """Return True if `other` has the same content, but for small changes of its times."""
+        """Return True if `other` has the same content, except for small differences of its times."""
         times = ((self.safe_until, other.safe_until), (self.begins or 0, other.begins or 0))
         close = all(abs(max(mine, now) - max(theirs, now)) < SAME for mine, theirs in times)
         return close and (self.by.client, self.by.id, self.rcs) == (other.by.client, other.by.id, other.rcs)
 
     def text(self, now: Ns, clock: Callable[[float], str] | None = None, by: str = "") -> str:
-        """In words. `clock` formats the time of day so many seconds from now; `by` names the request."""
+        """Return a text for people. `clock` formats the time of day that is so many seconds from now; `by` replaces the
+        name of the request or booking."""
         by = by or named(self.by.who, self.by.client, self.by.arc)
         rcs = ", ".join(self.rcs)
         if self.withdrawn:
@@ -64,7 +66,7 @@ class HoldNotice(NamedTuple):
 
 
 class NoticeTracker:
-    """The notices that the holder of one hold has received."""
+    """Decides which notices of one hold are new to its holder."""
 
     def __init__(self) -> None:
         self._known: dict[str, HoldNotice] = {}
@@ -72,11 +74,11 @@ class NoticeTracker:
 
     @property
     def next(self) -> Ns | None:
-        """When `take` is due, without news."""
+        """Time of the next due `take`, even without changes."""
         return min((since + WITHDRAWN_AFTER for since in self._missing.values()), default=None)
 
     def take(self, ends: Sequence[HoldNotice], now: Ns) -> list[HoldNotice]:
-        """The notices that are new, or withdrawn."""
+        """Take all present notices; return the new, changed and withdrawn notices."""
         news, present = [], {end.code: end for end in ends}
         for code, end in present.items():
             self._missing.pop(code, None)

@@ -1,4 +1,4 @@
-"""What a fleet has and who holds it, as text and as a table of a notebook. Pure."""
+"""Devices of a fleet with their holders, as text and as tables in a notebook. Pure."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ Row = tuple[str, ...]
 
 @dataclass(frozen=True)
 class LabStatus:
-    """The devices of a fleet with their holders, and the requests that wait, as the leader had them when it was asked.
+    """The devices of a fleet with their holders, and the waiting requests, at the time of the query.
 
-    Prints as text, and shows as tables in a notebook. `state` has the same for programs: `state.rcs`, `state.holds`
+    It prints as text, and shows as tables in a notebook. `state` has the same for programs: `state.rcs`, `state.holds`
     and `state.queue`, in the messages of the protocol."""
 
     fleet: str
@@ -43,21 +43,21 @@ class LabStatus:
             for rc in hold.needs:
                 holds.setdefault(rc, []).append(hold)
         devices: list[Row] = [
-            (clean(view.rc), clean(view.host), _stands(view, holds.get(view.rc, []))) for view in self.state.rcs
+            (clean(view.rc), clean(view.host), _availability(view, holds.get(view.rc, []))) for view in self.state.rcs
         ]
         yield ("DEVICE", "HOST", "HELD BY"), devices
         if self.state.queue:
-            waiting: list[Row] = [(named(one.who, one.client, one.arc), clean(one.reason)) for one in self.state.queue]
+            waiting: list[Row] = [(named(arc.who, arc.client, arc.arc), clean(arc.reason)) for arc in self.state.queue]
             yield ("WAITS", "WHY"), waiting
 
 
-def _stands(view: RcView, holds: Iterable[HoldView]) -> str:
+def _availability(view: RcView, holds: Iterable[HoldView]) -> str:
     if not view.present:
         return f"absent: {clean(view.reason)}" if view.reason else "absent"
-    return "; ".join(map(_held, holds)) or "free"
+    return "; ".join(map(_holder, holds)) or "free"
 
 
-def _held(hold: HoldView) -> str:
+def _holder(hold: HoldView) -> str:
     who = named(hold.who, hold.client, hold.arc)
     if hold.waits is not None:
         return f"{who}, {starting(hold.waits)}"

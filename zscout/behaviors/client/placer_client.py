@@ -1,4 +1,4 @@
-"""Requests to the component placer, and what it publishes."""
+"""Client of the component placer: requests, and its publications."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from zscout.messages import ComponentSpec, Placement, PlacementOperation, Placem
 from zscout.types import NO_TERM, SECOND, ComponentId, HostName, Term
 
 TIMEOUT: Final = 5.0
-"""Seconds of one query beyond its own `wait`: a placer that begins first asks all nodes what runs there."""
+"""Seconds of one query beyond its own `wait`: a new placer first asks all nodes for their components."""
 PLACER_TIMEOUT: Final = 30.0
 RETRY_AFTER: Final = 0.2
 REFRESH_EVERY: Final = 1.0
@@ -26,15 +26,15 @@ R = TypeVar("R")
 
 
 class PlacerSilent(RequestRefused):
-    """No component placer answered: what was requested may be done or not."""
+    """No component placer answered; the operation may or may not have been carried out."""
 
 
 class PlacerClient:
-    """The component placer, as one program knows it. `timeout`: seconds within which some placer answers,
-    though the lead changes meanwhile.
+    """Places and stops components. `timeout`: seconds within which some placer must answer, even if the leader changes
+    meanwhile.
 
-    As a context manager it follows `placements` (of the components in `only`, if given) by what is published
-    and by each answer."""
+    As a context manager it keeps `placements` (of the components in `only`, if given) up to date from publications and
+    answers."""
 
     def __init__(
         self, mesh: Mesh, only: Collection[ComponentId] | None = None, *, timeout: float = PLACER_TIMEOUT
@@ -56,23 +56,24 @@ class PlacerClient:
     # Requests
 
     async def place(self, component: ComponentId, spec: ComponentSpec, *, wait: float = 3.0) -> Placement:
-        """Has it run somewhere, or returns its placement if it does. Raises RequestRefused."""
+        """Start a component on some host, unless it runs; return its placement. `wait`: seconds for which the placer
+        waits for the start. Raises RequestRefused."""
         return await self.request(messages.PlaceComponent(component, spec, wait=wait), Placement)
 
     async def stop(self, component: ComponentId, *, wait: float = 0.0) -> Placement:
-        """Stops it for good. Raises RequestRefused."""
+        """Stop a component for good. Raises RequestRefused."""
         return await self.request(messages.EndComponent(component, wait=wait), Placement)
 
     async def request(self, operation: PlacerOperation, kind: type[R]) -> R:
-        """Repeats the operation, which must be idempotent, until a placer answers. Raises RequestRefused,
+        """Repeat an operation, which must be idempotent, until a placer answers. Raises RequestRefused,
         PlacerSilent."""
         silent = f"the component placer of fleet {self.mesh.keys.fleet} did not answer for {self._timeout:.0f} s"
         remedy = "see zscout status, and the log of zscout-node where it leads"
         return await self._until(lambda: self._ask(operation, kind), f"{silent}; {remedy}")
 
     async def request_once(self, operation: PlacementOperation, done: Callable[[Placement], bool]) -> Placement:
-        """Does not repeat the operation where `done(placement)` says that it was done though its answer is
-        missing. Raises RequestRefused, PlacerSilent."""
+        """Like `request`, for an operation that is not idempotent: without an answer, it is repeated only if
+        `done(placement)` is false for the component's placement. Raises RequestRefused, PlacerSilent."""
 
         async def attempt() -> Placement | None:
             if (answer := await self._ask(operation, Placement)) is not None:
@@ -97,16 +98,16 @@ class PlacerClient:
     # Placements
 
     async def refresh(self) -> None:
-        """Lists all placements, or those in `only`. Raises RequestRefused, PlacerSilent."""
+        """Query all placements, or those in `only`. Raises RequestRefused, PlacerSilent."""
         self._listed(await self.request(self._list, Placements))
 
     async def try_refresh(self) -> None:
-        """The same with one query: without an answer `placements` stay as they are."""
+        """Like `refresh`, with a single query: without an answer, `placements` stay unchanged."""
         if (listed := await self._ask(self._list, Placements)) is not None:
             self._listed(listed)
 
     async def wait_changed(self) -> None:
-        """Waits until something is published, and lists the placements if nothing is for a second. Raises
+        """Wait for the next publication or answer; after REFRESH_EVERY seconds without one, refresh. Raises
         RequestRefused, PlacerSilent."""
         if not await done_within(REFRESH_EVERY, self.changed.wait()):
             await self.refresh()
@@ -119,7 +120,7 @@ class PlacerClient:
         self.changed.set()
 
     async def _ask(self, operation: PlacerOperation, kind: type[R]) -> R | None:
-        """One query; None: no answer, or the placer can't answer now. Raises RequestRefused."""
+        """Send a single query. None: no answer, or a placer that can't answer now. Raises RequestRefused."""
         timeout = TIMEOUT + (operation.wait if isinstance(operation, PlacementOperation) else 0.0)
         replies = await self.mesh.ask(
             self.mesh.keys.placer(self.mesh.me),

@@ -127,7 +127,7 @@ class OpenArc:
     _waits_since: Ns | None = None
     """Begin of its present wait, under any RCM."""
     _unconfirmed: tuple[Grant, list[str]] | None = None
-    """A grant and those of its RCs that did not confirm it, until the RCM has answered that report."""
+    """A grant and the RCs that did not confirm it, until the RCM has answered that report."""
     _settling: Grant | None = None
     """A grant of which some RCs are still settling."""
     _left: Grant | None = None
@@ -135,7 +135,7 @@ class OpenArc:
     _unserved: Grant | None = None
     """A grant whose time passed while RCs were settling, until the RCM has answered that report."""
     _ending: HoldEnd | None = None
-    """How the last hold ended; `outcome` and `reason` are those of the newest notice of any kind."""
+    """How the last hold ended; `outcome` and `reason` come from the newest notice of any kind."""
     _place_shown_in: Term = NO_TERM
     """Term in which the client last showed its place to an RCM that had assigned a worse one."""
     _last: tuple[Term, int] = field(default=(NO_TERM, 0))

@@ -57,7 +57,8 @@ class OutgoingMove:
         self._name, self.to, self.incarnation = order.component, order.to, order.to_incarnation
         self._patience = order.patience
         self.successor_runs = asyncio.Event()
-        """Set by the lifecycle once the successor's token is on the mesh: it runs, whatever its node answers."""
+        """Set by the lifecycle once the successor's token is on the mesh: it runs, even if its node answers
+        otherwise."""
         self.began = False
         """True once the component is paused for this move."""
         self._seen: Ns | None = None
