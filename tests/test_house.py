@@ -34,7 +34,8 @@ PLAIN = [
     *("zscout/behaviors", "zscout/drivers"),
     *("zscout/components", "zscout/config", "zscout/placement", "zscout/simulation", "zscout/testing"),
     *("zscout/mesh", "zscout/messages", "zscout/services/bookings", "zscout/services/node"),
-    *("zscout/services/metrics", "zscout/services/placement"),
+    *("zscout/services/journal", "zscout/services/metrics", "zscout/services/notify", "zscout/services/placement"),
+    "zscout/services/plain_http.py",
     *("zscout/keyexpr.py", "zscout/logs.py", "zscout/ports.py", "zscout/streams.py", "zscout/terminal.py"),
     *("zscout/trace.py", "zscout/types.py"),
 ]

@@ -10,7 +10,7 @@ from tests.services.journal.kit import past
 from zscout.cli import journals
 from zscout.config.strict import BadInput
 from zscout.messages import UNHEARD, History, JournalGap, ReasonParty, Who
-from zscout.services.journal.asking import Told
+from zscout.services.journal.asking import FleetHistory
 from zscout.services.journal.merging import Span
 
 
@@ -47,7 +47,7 @@ def test_an_end_in_words() -> None:
 def test_what_is_not_known_is_told_with_why() -> None:
     anvil = History("anvil", 200.0, 50.0, gaps=[JournalGap(120.0, 140.0, "off"), JournalGap(130.0, 135.0, "silent")])
     bellows = History("bellows", 200.0, 130.0)
-    told = Told(Span(100.0, 200.0), [], False, {"anvil": anvil, "bellows": bellows}, ["forge"])
+    told = FleetHistory(Span(100.0, 200.0), [], False, {"anvil": anvil, "bellows": bellows}, ["forge"])
     assert told.unknown == [Span(120.0, 130.0)]
     first, second = journals.remarks(told)
     assert first.endswith("the journals are incomplete: anvil did not run; bellows has no entries of that time")

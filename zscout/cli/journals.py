@@ -18,7 +18,7 @@ from zscout.config.strict import DURATIONS, BadInput, parse_duration, quoted
 from zscout.keyexpr import MAX_NAME, check_need
 from zscout.messages import MAX_ASKED_NAMES, HistoryAsk, PastHold, ReasonParty
 from zscout.services.journal import asking
-from zscout.services.journal.asking import Told
+from zscout.services.journal.asking import FleetHistory
 from zscout.terminal import Table, clean, span
 
 if TYPE_CHECKING:
@@ -107,7 +107,7 @@ def names_of(fleet: Fleet, users: Sequence[str], group: str | None) -> list[str]
     return names
 
 
-async def ask_journals(client: Client, asked: HistoryAsk, most: int) -> Told:
+async def ask_journals(client: Client, asked: HistoryAsk, most: int) -> FleetHistory:
     """The latest holds, `most` at most, from as few journals as know all that any knows. Raises Failed where none
     answers, and NobodyThere where no candidate is seen."""
     try:
@@ -122,14 +122,14 @@ async def ask_journals(client: Client, asked: HistoryAsk, most: int) -> Told:
 # Words
 
 
-def remarks(told: Told) -> Iterable[str]:
+def remarks(told: FleetHistory) -> Iterable[str]:
     for one in told.unknown:
         yield f"from {local(one.began)} to {local(one.ended)} the journals are incomplete: {told.causes(one)}"
     if told.without:
         yield f"no journal of {', '.join(told.without)}: off, older than 0.3.0, or too slow"
 
 
-def as_json(told: Told, fleet: str, **of: object) -> dict[str, Any]:
+def as_json(told: FleetHistory, fleet: str, **of: object) -> dict[str, Any]:
     candidates: list[dict[str, Any]] = [
         {
             "host": host,
@@ -216,12 +216,12 @@ def _cell(cell: object) -> object:
     return f"'{clean(cell)}" if cell.startswith(FORMULA) else clean(cell)
 
 
-def print_remarks(told: Told, *, err: bool = False) -> None:
+def print_remarks(told: FleetHistory, *, err: bool = False) -> None:
     for line in remarks(told):
         click.secho(clean(line), fg="yellow", err=err)
 
 
-def holds_table(title: str, told: Told, holds: Sequence[PastHold], *, proven: bool) -> Table:
+def holds_table(title: str, told: FleetHistory, holds: Sequence[PastHold], *, proven: bool) -> Table:
     rows, styles = [], []
     for hold in holds:
         waited = "?" if hold.waited is None else span(hold.waited)

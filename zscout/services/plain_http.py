@@ -1,4 +1,4 @@
-"""A small read-only server of texts over plain HTTP: `GET` and `HEAD`, one request to a connection."""
+"""A small read-only server of texts over plain HTTP: `GET` and `HEAD`, one request per connection."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from zscout.mesh.supervision import clock
 log = logging.getLogger(__name__)
 
 MAX_CONNECTIONS: Final = 32
-"""Served at one time: one more takes the place of the oldest, of those without a request first."""
+"""Connections at one time: a further one replaces the oldest, preferably without a request yet."""
 MAX_HEAD: Final = 8_192
 """Bytes of a request."""
 
@@ -25,41 +25,41 @@ _HOST: Final = re.compile(rb"\r\nhost:[ \t]*([^\r\n]*?)[ \t]*(?=\r\n)", re.IGNOR
 
 
 class Page(NamedTuple):
-    """What is answered."""
+    """An answer."""
 
     text: bytes
     kind: str = "text/plain"
     status: str = "200 OK"
     headers: str = ""
-    """More of them, each ended by CR LF."""
+    """Further headers, each ended by CR LF."""
 
 
 class PlainHttpServer(ABC):
-    """`what` it serves, for the log."""
+    """A server; `what` names its contents, for the log."""
 
     timeout = 5.0
-    """Seconds from a connection to its end."""
+    """Seconds that a connection may last."""
 
     def __init__(self, what: str, bind: str, port: int) -> None:
         self._what, self.bind, self.port = what, bind, port
         self._tasks: dict[asyncio.Task[None], bool] = {}
-        """Oldest first; by connection, whether its request has come."""
+        """Connections, oldest first; True once the request has arrived."""
         self._names = {"localhost", bind.lower(), socket.gethostname().lower()}
         self._knows_domain = False
         self._server: asyncio.Server | None = None
-        self._strange = SparseLog(log, clock.now)
+        self._failures_log = SparseLog(log, clock.now)
 
     @abstractmethod
     async def page(self, path: str) -> Page | None:
-        """What stands at a path, without what follows a `?`; None: nothing. It may be called many times at once."""
+        """The page at a path (without the query string), None if there is none. Called concurrently."""
 
     @property
     @abstractmethod
     def where(self) -> str:
-        """Where something stands, for who asked for what does not."""
+        """Names the valid paths; the answer to any other path."""
 
     async def start(self) -> None:
-        """Raises OSError where the port can't be had. Port 0 becomes a free one."""
+        """Start serving. Raises OSError if the port is not available. Port 0 becomes a free port."""
         self._server = await asyncio.start_server(self._accept, self.bind, self.port, limit=MAX_HEAD, backlog=16)
         self.port = self._server.sockets[0].getsockname()[1]
 
@@ -91,9 +91,9 @@ class PlainHttpServer(ABC):
                 writer.close()
                 await writer.wait_closed()
         except (TimeoutError, asyncio.IncompleteReadError, asyncio.LimitOverrunError, OSError):
-            pass  # whoever asked is slow, gone, or no HTTP client
-        except Exception as error:  # noqa: BLE001 - what is served disturbs nothing else
-            self._strange.warning("", "%s can't be served: %r", self._what, error)
+            pass  # the client is slow, gone, or does not speak HTTP
+        except Exception as error:  # noqa: BLE001 - a failing page must not stop the service
+            self._failures_log.warning("", "%s can't be served: %r", self._what, error)
         finally:
             writer.transport.abort()
 
@@ -102,7 +102,7 @@ class PlainHttpServer(ABC):
         path = rest.partition(b" ")[0].partition(b"?")[0].decode("ascii", "replace")
         found = None
         if not await self._is_named(head):
-            # A page of another site, which a browser took for this host.
+            # DNS rebinding: a page of another site that a browser took for this host.
             words = f"not a name of this host; use {socket.gethostname()} or its address\n"
             found = Page(words.encode(), status="421 Misdirected Request")
         elif path.startswith("/"):
@@ -116,7 +116,7 @@ class PlainHttpServer(ABC):
         return text if method == b"HEAD" else text + page.text
 
     async def _is_named(self, head: bytes) -> bool:
-        """Return True if a request is for this host by an address or a name of its own, or names none."""
+        """Return True if a request names this host, an IP address, or no host."""
         hosts = _HOST.findall(head)
         if len(hosts) != 1:
             return not hosts

@@ -235,7 +235,7 @@ async def test_no_flood_of_words_on_use_takes_unbounded_room(tmp_path: Path, mon
     await told.tells(lambda found: found.holds)
     rc.publish(used=[HoldUse(Grant(grant.term, 10**6 + number), 1.0) for number in range(200)])
     journal = told.journals["x"]
-    await until(lambda: len(journal._uses) == journal._said_count == 20)
+    await until(lambda: len(journal._uses) == journal._reported_count == 20)
     await until(lambda: not journal._uses)
     rc.publish(used=[HoldUse(grant, 5.5)])
     await until(lambda: journal._uses)
@@ -245,11 +245,11 @@ async def test_no_flood_of_words_on_use_takes_unbounded_room(tmp_path: Path, mon
     for number in range(30):
         rc.name = f"robot/{number}"
         rc.mesh.publisher(rc.mesh.keys.rc_state(rc.name), RcState).put(rc.state(used=[HoldUse(grant, 1.0)]))
-        await until(lambda: rc.name in journal._said and not journal._uses)
-    assert journal._said_count == len(journal._said) == 20
+        await until(lambda: rc.name in journal._reported and not journal._uses)
+    assert journal._reported_count == len(journal._reported) == 20
     rc.mesh.publisher(rc.mesh.keys.rc_state(rc.name), RcState).put(rc.state())
-    await until(lambda: "robot/29" not in journal._said)
-    assert journal._said_count == len(journal._said) == 19
+    await until(lambda: "robot/29" not in journal._reported)
+    assert journal._reported_count == len(journal._reported) == 19
     await told.close()
 
 
@@ -294,7 +294,7 @@ async def test_a_failing_disk_stops_nothing_and_is_told_once(tmp_path: Path, cap
     (hold,) = (await told.tells(lambda found: found.holds)).holds
     assert hold.arc == "survey"
     await told.close()
-    assert [record.message for record in caplog.records if "can't be kept" in record.message][1:] == []
+    assert [record.message for record in caplog.records if "can't be written" in record.message][1:] == []
 
 
 async def test_bad_questions_are_refused(tmp_path: Path) -> None:

@@ -42,7 +42,7 @@ async def test_it_arrives_as_text_at_the_urls_and_at_the_user_concerned() -> Non
     with Receiver() as lab, Receiver() as ada, Receiver() as bob:
         table = NotifyTable((lab.url,), ("yours_now",), {"ada": (ada.url,), "bob": (bob.url,)}, after=SECOND)
         telling = started(notifier(table))
-        telling.tell(NEWS)  # of what the lab's URL does not hear
+        telling.notify(NEWS)  # of what the lab's URL does not hear
         telling.holds.on_began(of(ADA, 100))
         await asyncio.to_thread(lab.until, lambda: len(lab.heard) == 1)
         await asyncio.to_thread(ada.until, lambda: len(ada.heard) == 2)
@@ -59,12 +59,12 @@ async def test_it_arrives_as_text_at_the_urls_and_at_the_user_concerned() -> Non
 async def test_apprise_that_hangs_is_ended(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
     telling = notifier(NotifyTable(("json://localhost",)))
     monkeypatch.setattr(apprise_process, "TIMEOUT", 0.001)
-    telling.tell(NEWS)
+    telling.notify(NEWS)
     telling.start()
     await asyncio.to_thread(telling._waiting.join)
     telling.stop()
     assert [record.getMessage() for record in caplog.records] == [
-        "notify.urls[0] was not told, in 3 attempts: Apprise did not end within 0.001 s"
+        "notify.urls[0] was not notified in 3 attempts: Apprise did not end within 0.001 s"
     ]
     with pytest.raises(BadInput, match=r"notify: can't be checked: Apprise did not end within 0\.001 s; try "):
         notifier(NotifyTable(("json://localhost",)))
@@ -74,7 +74,7 @@ async def test_apprise_that_hangs_is_ended(monkeypatch: pytest.MonkeyPatch, capl
 async def test_what_is_refused_is_tried_again() -> None:
     with Receiver(refuses=2) as lab:
         telling = started(notifier(NotifyTable((lab.url,))))
-        telling.tell(NEWS)
+        telling.notify(NEWS)
         await asyncio.to_thread(lab.until, lambda: len(lab.heard) == 1)
         telling.stop()
         assert lab.asked == 3
@@ -88,15 +88,15 @@ async def test_who_can_not_be_reached_is_logged_once_without_its_url_and_holds_u
     with Receiver(refuses=1_000) as broken, Receiver() as lab:
         telling = started(notifier(NotifyTable((broken.url, lab.url), per_minute=600)))
         for number in range(2):
-            telling.tell(NEWS._replace(title=f"{number}"))
+            telling.notify(NEWS._replace(title=f"{number}"))
         await asyncio.to_thread(lab.until, lambda: len(lab.heard) == 2)
         telling.stop()
         # Once it has failed it is left alone for a while.
         assert broken.asked == 3
     lines = [record.getMessage() for record in caplog.records if record.name.startswith("zscout")]
     assert lines == [
-        "notify.urls[0] was not told, in 3 attempts: it did not take it",
-        "notify.urls[0] can't be reached: a notification is left out",
+        "notify.urls[0] was not notified in 3 attempts: the service refused it",
+        "notify.urls[0] can't be reached: dropped a notification",
     ]
     assert Receiver.SECRET not in caplog.text
 
@@ -107,15 +107,15 @@ async def test_what_is_too_much_is_left_out(caplog: pytest.LogCaptureFixture) ->
         # It has not begun to send.
         telling = notifier(NotifyTable((lab.url,), per_minute=1))
         for _ in range(QUEUE + 5):
-            telling.tell(NEWS)
+            telling.notify(NEWS)
         telling.start()
         await asyncio.to_thread(lab.until, lambda: len(lab.heard) == 1)
         await asyncio.to_thread(telling._waiting.join)
         telling.stop()
         assert len(lab.heard) == 1
     assert [record.getMessage() for record in caplog.records] == [
-        f"{QUEUE} notifications wait to be sent: one is left out",
-        "notify.urls[0]: more than 1 a minute, the rest is left out",
+        f"{QUEUE} notifications are waiting: dropped another",
+        "notify.urls[0]: more than 1 a minute; dropping the rest",
     ]
 
 

@@ -14,7 +14,7 @@ from tests.services.journal.test_journal import START, telling
 from tests.services.recorder.kit import recording
 from tests.services.recorder.paper_run import colours, events, lanes
 from zscout.messages import History, JournalGap, Release
-from zscout.services.journal.asking import Told as Journals
+from zscout.services.journal.asking import FleetHistory as Journals
 from zscout.services.journal.merging import Span
 from zscout.services.recorder import past as module
 from zscout.services.recorder.colours import ABSENT, OPERATOR, PALETTE, faded
@@ -85,7 +85,7 @@ def test_what_is_not_known_is_told_in_words() -> None:
     # Nothing is said of when there was no journal yet, nor of what is recorded.
     assert found.gaps == [
         "from 01 Jan 00:05:00 to 01 Jan 00:06:00 UTC the journals are incomplete: anvil did not run",
-        "from 01 Jan 00:16:30 to 01 Jan 00:16:40 UTC the journals are incomplete: anvil heard no RCM",
+        "from 01 Jan 00:16:30 to 01 Jan 00:16:40 UTC the journals are incomplete: anvil received nothing from an RCM",
     ]
     assert [at + ZERO for at, _ in found.lanes["robot/a"]] == [200, 250, 300, 360, 990, ZERO]
     latest = past_of(Journals(Span(0.0, ZERO), [past(1, 900, 950)], True, {"anvil": anvil}, []), ZERO, ZERO, 10)

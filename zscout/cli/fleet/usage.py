@@ -13,7 +13,7 @@ from zscout.config.fleet import Fleet
 from zscout.config.strict import BadInput
 from zscout.messages import HistoryAsk, PastHold
 from zscout.services.journal.accounts import Account, accounts
-from zscout.services.journal.asking import Told
+from zscout.services.journal.asking import FleetHistory
 from zscout.terminal import Table, span
 
 MAX_HOLDS = 200_000
@@ -85,7 +85,7 @@ def _rounded(account: Account) -> dict[str, object]:
     return {name: round(value, 3) if isinstance(value, float) else value for name, value in asdict(account).items()}
 
 
-def _table(found: list[Account], by: str, told: Told) -> Table:
+def _table(found: list[Account], by: str, told: FleetHistory) -> Table:
     rows = [
         (
             *(one.key, str(one.holds), span(one.held), span(one.rc_seconds)),
@@ -107,7 +107,7 @@ def _unknown_use(found: list[Account]) -> str:
     return f"{words}: {', '.join(some[:MAX_NAMED])}{more}" if some else ""
 
 
-def _print_remarks(told: Told, found: list[Account], *, err: bool = False) -> None:
+def _print_remarks(told: FleetHistory, found: list[Account], *, err: bool = False) -> None:
     if words := _unknown_use(found):
         click.secho(terminal.clean(words), fg="yellow", err=err)
     if told.more:

@@ -1,4 +1,4 @@
-"""Usage accounts from a list of holds. Pure. All times are seconds within the window; others are not counted."""
+"""Usage accounts from a list of holds. Pure. Only seconds within the window are counted."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ class Account:
 def accounts(
     holds: Iterable[PastHold], keys: Callable[[PastHold], Iterable[str]], window: Span, *, by_rc: bool = False
 ) -> list[Account]:
-    """An account for each of `keys` of any hold, by seconds held, descending. Present holds count up to the window's
-    end; ends that were missed count as far as known. `by_rc`: the keys are RCs."""
+    """An account for each key in `keys` of any hold, by seconds held, descending. Holds in force count up to the
+    window's end; if the end of a hold was missed, it counts as far as known. `by_rc`: the keys are RCs."""
     found: dict[str, Account] = {}
     for hold in holds:
         ended = window.ended if hold.ended is None else hold.ended
@@ -49,10 +49,10 @@ def accounts(
             if hold.waited is not None and hold.began >= window.began:
                 account.waited += hold.waited
             rcs = [key] if by_rc else hold.rcs
-            if told := [hold.used[rc] for rc in rcs if rc in hold.used]:
-                part = held / stood if (stood := ended - hold.began) > 0 else 1.0
-                account.used = (account.used or 0.0) + sum(min(seconds * part, held) for seconds in told)
-            account.used_unknown += len(told) < len(rcs)
+            if known := [hold.used[rc] for rc in rcs if rc in hold.used]:
+                part = held / lasted if (lasted := ended - hold.began) > 0 else 1.0
+                account.used = (account.used or 0.0) + sum(min(seconds * part, held) for seconds in known)
+            account.used_unknown += len(known) < len(rcs)
             if ends_here and hold.outcome == "preempted":
                 account.preempted += 1
                 account.preempted_seconds += held

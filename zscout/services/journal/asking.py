@@ -23,21 +23,23 @@ QUIET: Final = 0.3  # seconds without another candidate that end the search
 AT_ONCE: Final = 16  # candidates queried at one time
 CAUSES: Final[Mapping[str, str]] = {
     "off": "did not run",
-    "silent": "heard no RCM",
+    "silent": "received nothing from an RCM",
     "missed": "missed publications",
-    "dropped": "could not keep all",
+    "dropped": "could not store everything",
 }
 
 
 class NoJournal(Exception):
-    """No journal, or not all of it, is available; one line with the reason."""
+    """A journal is not available, or only in part; the text is one line with the reason."""
 
 
 class NoCandidate(NoJournal): ...
 
 
 @dataclass(frozen=True, slots=True)
-class Told:
+class FleetHistory:
+    """The merged answers of the journals of a fleet."""
+
     window: Span
     holds: Sequence[PastHold]  # by start; the latest, if there are too many
     more: bool  # True if there are earlier ones
@@ -50,7 +52,7 @@ class Told:
         return unknown_to_all([*self.journals.values()], self.window)
 
     def causes(self, unknown: Span) -> str:
-        """Why each candidate lacks it."""
+        """Why each candidate lacks the period `unknown`."""
         words = []
         for host, journal in sorted(self.journals.items()):
             found = [
@@ -72,7 +74,7 @@ async def ask_journals(
     *,
     look: float = QUIET,
     wall: Callable[[], float] = time.time,
-) -> Told:
+) -> FleetHistory:
     """The latest holds, at most `most`, from as few journals as cover all. `look`: seconds for a first candidate to
     appear; `wall`: seconds since 1970, UTC. Raises NoJournal if none answers, or one stops midway."""
     hosts = await _candidates(mesh, fleet, look)
@@ -111,7 +113,7 @@ async def ask_journals(
     found = await asyncio.gather(*map(pages, enough(journals, window)))
     holds = merged(some for some, _ in found)
     more = len(holds) > most or any(left for _, left in found)
-    return Told(window, holds[-most:], more, journals, [host for host in hosts if host not in journals])
+    return FleetHistory(window, holds[-most:], more, journals, [host for host in hosts if host not in journals])
 
 
 async def _candidates(mesh: Mesh, fleet: Fleet, look: float) -> list[HostName]:

@@ -39,11 +39,11 @@ class StateRead(NamedTuple):
 class UseHeard(NamedTuple):
     """Use reported by RCs: (RC, grant, seconds), with the RC of the report's key."""
 
-    words: Sequence[tuple[RcName, Grant, float]]
+    reports: Sequence[tuple[RcName, Grant, float]]
 
 
 class ClockSet(NamedTuple):
-    """This host's clock was set, by so many seconds: what was read on it before is off by as much."""
+    """This host's clock was set forward `by` seconds: earlier times are off by as much."""
 
     by: float
 
@@ -53,7 +53,7 @@ class HoldSeen(NamedTuple):
 
 
 class HoldOver(NamedTuple):
-    """A hold ended; `hold` holds the whole record in case it is unknown."""
+    """A hold ended; `hold` is its whole record, in case it is unknown."""
 
     hold: messages.PastHold
 
@@ -85,18 +85,18 @@ class Follower:
     """Follows one fleet. `silent`: seconds without a heartbeat that mean a lost RCM."""
 
     def __init__(self, silent: float, open_holds: Iterable[Grant] = (), heard: float | None = None) -> None:
-        """Holds, and time of the last publication, when the journal was closed."""
+        """`open_holds` and the last publication's time `heard` are from the closing of the journal."""
         self._silent = silent
         self._open: dict[Grant, None] = dict.fromkeys(open_holds)
         self._term, self._seq = NO_TERM, 0
         self._left = heard  # time of that close, until the next publication
         self._doubt: float | None = None  # since then ends may have been missed
         self._early: OrderedDict[tuple[Grant, RcName], float] = OrderedDict()
-        """Use under unfollowed grants, ended or not known yet; the last MAX_EARLY."""
+        """Use under grants that are not followed, ended or not known yet; at most MAX_EARLY, the latest."""
         self.must_read = False  # true while the RCM's state must be read, and passed as a `StateRead`
 
     def take(self, event: Heard) -> Iterator[Change]:
-        """The resulting changes; none for an earlier term."""
+        """Yield the resulting changes; none for an earlier term."""
         match event:
             case PublicationHeard():
                 return self._heard(event)
@@ -128,7 +128,7 @@ class Follower:
             for holder in holders:
                 if holder.grant not in self._open and _is_sane(holder.grant):
                     ours = holder.grant.term == grants.term
-                    yield from self._stands(_held(holder, at, waited.get(holder.grant.seq) if ours else None, grants))
+                    yield from self._in_force(_held(holder, at, waited.get(holder.grant.seq) if ours else None, grants))
         for revoked in grants.revoked:
             if _is_sane(revoked.grant):
                 self._open.pop(revoked.grant, None)
@@ -155,27 +155,27 @@ class Follower:
             return
         self._seq = state.seq
         since, self._doubt, self.must_read = self._doubt, None, False
-        stands = {hold.grant for hold in state.holds}
-        for grant in [grant for grant in self._open if grant not in stands]:
+        current = {hold.grant for hold in state.holds}
+        for grant in [grant for grant in self._open if grant not in current]:
             del self._open[grant]
             yield EndUnheard(grant, at if since is None else since)
         for hold in state.holds:
             if hold.grant not in self._open and _is_sane(hold.grant):
-                yield from self._stands(_viewed(hold, at))
+                yield from self._in_force(_viewed(hold, at))
 
     def lost(self, gap: messages.JournalGap) -> Iterator[Change]:
-        """Changes could not be kept, possibly ends."""
+        """Changes could not be stored, possibly ends of holds."""
         self._doubt, self.must_read = gap.began if self._doubt is None else min(self._doubt, gap.began), True
         yield GapSeen(gap)
 
-    def _stands(self, hold: messages.PastHold) -> Iterator[Change]:
+    def _in_force(self, hold: messages.PastHold) -> Iterator[Change]:
         if len(self._open) < MAX_OPEN:
             self._open[hold.grant] = None
         yield HoldSeen(hold)
         yield from self._used_early(hold)
 
     def _used(self, event: UseHeard) -> Iterator[Change]:
-        for rc, grant, seconds in event.words:
+        for rc, grant, seconds in event.reports:
             if _is_sane(grant) and 0 <= seconds <= MAX_NUMBER:
                 yield HoldUsed(grant, rc, seconds)
                 if grant not in self._open:
@@ -243,7 +243,7 @@ def _names(number: str, arc: str, client: str, grant: Grant, rcs: list[str]) -> 
 
 
 def _user(who: messages.Who | None) -> messages.Who | None:
-    """Without the comment."""
+    """The requester without the comment."""
     if who is None or not (who.user or who.host or who.command):
         return None
     return messages.Who(
@@ -256,5 +256,5 @@ def _text(text: str) -> str:
 
 
 def _number(number: N) -> N:
-    """A number that readers of an answer accept."""
+    """Clamp a number to the range that readers of an answer accept."""
     return max(min(number, type(number)(MAX_NUMBER)), type(number)(-MAX_NUMBER))

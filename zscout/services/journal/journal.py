@@ -26,16 +26,16 @@ from zscout.types import NO_TERM, SECOND, Grant, Ns, RcName, Term
 log = logging.getLogger(__name__)
 
 COMMIT_EVERY: Final = 1.0  # seconds between two commits
-HEARD_EVERY: Final = 30.0  # seconds after which a quiet RCM is noted as alive
+HEARD_EVERY: Final = 30.0  # seconds after which the last publication of a quiet RCM is stored
 READ_EVERY: Final = 2.0  # seconds between two queries for the RCM's state, while it is needed
 AGAIN_AFTER: Final = 30.0  # seconds until a failed disk is retried
-MAX_GATHERED: Final = 100_000  # holders and ends awaiting a commit; more are dropped as a gap
+MAX_GATHERED: Final = 100_000  # holders and ends awaiting a commit; further ones are dropped, and make a gap
 MAX_USES: Final = 10_000  # reports of use awaiting a commit, or remembered against duplicates
 MAX_TOLD: Final = 5_000  # holds passed to `on_opened`
 MAX_ASKING: Final = 16  # queries answered at one time
 ENDS_WITHIN: Final = 5.0
-STEADY: Final[Ns] = 600 * SECOND  # since the wall clock was set; before, nothing is removed for its age
-CLOCK_SET: Final = 2.0  # seconds by which the wall clock moves against the mesh's, if it was set
+STEADY: Final[Ns] = 600 * SECOND  # after the wall clock was set, until which no hold is removed for its age
+CLOCK_SET: Final = 2.0  # a change of the wall clock against the mesh's, in seconds, that means it was set
 MEGABYTE: Final = 1_000_000
 
 
@@ -55,26 +55,31 @@ class Journal:
         reopened journal, oldest first."""
         self._mesh, self._silent, self._wall, self._on_opened = mesh, silent, wall, on_opened
         self._store = JournalStore(folder, config.max_age / SECOND, config.max_size * MEGABYTE)
-        self._supervisor = Supervisor("the journal", lambda _: log.error("no journal is kept until this node restarts"))
+        self._supervisor = Supervisor(
+            "the journal", lambda _: log.error("no journal is written until this node restarts")
+        )
         self._gathered: list[Heard] = []
         self._weight = 0  # of the gathered events
         self._uses: dict[tuple[RcName, Grant], float] = {}  # most seconds of use since the last commit
-        self._said: OrderedDict[RcName, dict[Grant, tuple[float, bool]]] = OrderedDict()  # last reports, and if over
-        self._said_count = 0
+        self._reported: OrderedDict[RcName, dict[Grant, tuple[float, bool]]] = (
+            OrderedDict()
+        )  # last reports; True if the hold ended
+        """By RC and grant: the last report, True if the hold ended."""
+        self._reported_count = 0
         self._number: tuple[Term, int] = NO_TERM, 0
         self._at: Ns | None = None  # last publication, by the mesh's clock
         self._set_at = mesh.now()
-        self._ahead: float | None = None  # by how much the wall clock was ahead of that clock then
-        self._first = self._heard = 0.0  # first and last publication known to this journal
-        self._committed = 0.0  # publications up to here are noted as received
+        self._ahead: float | None = None  # wall clock minus the mesh's clock at the last publication
+        self._first = self._heard = 0.0  # times of the first and last publication known to this journal
+        self._committed = 0.0  # time of the last publication that was stored as received
         self._dropped, self._dropped_since = 0, 0.0
-        self._follower: Follower | None = None  # none: the file is not open
+        self._follower: Follower | None = None  # None while the file is not open
         self._pending: list[Change] = []  # derived, but not written
-        self._told = False
+        self._opened = False
         self._troubled: str | None = None
         self._not_before: Ns = 0
         self._read_at: Ns = 0
-        self._used_last = False  # true with an RC's last report on an ended hold
+        self._used_last = False  # True if an RC reported an ended hold
         self._ending = asyncio.Event()
         self._reading = asyncio.Lock()
         self._declared: list[Declaration] = []
@@ -83,7 +88,7 @@ class Journal:
         mesh, guard = self._mesh, self._supervisor.guard
         self._declared = [
             mesh.serve(mesh.keys.history_any(mesh.me.host), HistoryAsk, guard(self._on_asked), unanswered=MAX_ASKING),
-            # The candidate subscribes alike: a state is decoded once.
+            # The candidate has an equal subscription: a state is decoded once.
             mesh.subscribe(mesh.keys.rc_state_any, RcState, guard(self._on_rc_state)),
         ]
         self._keeping = self._supervisor.spawn(self._keep())
@@ -97,11 +102,12 @@ class Journal:
         await self._supervisor.close()
 
     def hear(self, grants: Grants) -> None:
-        """Take each publication of the leader, heartbeats too. Raises nothing: candidates lead without a journal."""
+        """Take each publication of the leader, heartbeats included. Never raises: candidates also lead without a
+        journal."""
         try:
             if self._supervisor.active:
                 self._hear(grants)
-        except Exception as error:  # noqa: BLE001 - it is logged there
+        except Exception as error:  # noqa: BLE001 - `fail` logs it
             self._supervisor.fail(error)
 
     def _hear(self, grants: Grants) -> None:
@@ -126,33 +132,33 @@ class Journal:
         self._gathered.append(event)
 
     def _on_rc_state(self, key: str, state: RcState) -> None:
-        if self._mesh.keys.rc_of(key) != state.rc or not (state.used or state.rc in self._said):
+        if self._mesh.keys.rc_of(key) != state.rc or not (state.used or state.rc in self._reported):
             return
-        holds, said, before = {holder.grant for holder in state.holders}, {}, self._said.pop(state.rc, {})
+        holds, current, before = {holder.grant for holder in state.holders}, {}, self._reported.pop(state.rc, {})
         for use in state.used:
             ended = state.leaving or use.grant not in holds
             if (use.seconds, ended) > before.get(use.grant, (-1.0, False)):
-                word = state.rc, use.grant
-                if word not in self._uses and len(self._uses) >= MAX_USES:
-                    continue  # it is repeated
-                self._uses[word] = max(use.seconds, self._uses.get(word, 0.0))
+                hold = state.rc, use.grant
+                if hold not in self._uses and len(self._uses) >= MAX_USES:
+                    continue  # the RC repeats it
+                self._uses[hold] = max(use.seconds, self._uses.get(hold, 0.0))
                 self._used_last |= ended
-            said[use.grant] = use.seconds, ended
-        if said:
-            self._said[state.rc] = said
-        self._said_count += len(said) - len(before)
-        while self._said_count > MAX_USES:
-            self._said_count -= len(self._said.popitem(last=False)[1])
+            current[use.grant] = use.seconds, ended
+        if current:
+            self._reported[state.rc] = current
+        self._reported_count += len(current) - len(before)
+        while self._reported_count > MAX_USES:
+            self._reported_count -= len(self._reported.popitem(last=False)[1])
 
     async def _keep(self) -> None:
         while not self._ending.is_set():
             await done_within(COMMIT_EVERY, self._ending.wait())
             now = self._mesh.now()
             news = self._gathered or self._pending or self._dropped or self._heard - self._committed > HEARD_EVERY
-            # Use under open holds grows all the time: it is written with other changes.
+            # Use under open holds grows continuously: it is written only with other changes.
             news = news or self._used_last
             last = self._ending.is_set() and self._heard > self._committed
-            # Opened before any publication, to answer queries.
+            # The file is opened before any publication, to answer queries.
             if last or (now >= self._not_before and (news or self._follower is None)):
                 await self._commit()
             if self._follower is not None and self._follower.must_read and now - self._read_at > READ_EVERY * SECOND:
@@ -163,18 +169,18 @@ class Journal:
     async def _commit(self) -> None:
         try:
             if self._follower is None:
-                stood, left = await asyncio.to_thread(self._store.open)
-                latest = [] if self._told else await asyncio.to_thread(self._store.latest, MAX_TOLD)
-                self._follower = Follower(self._silent, stood, left)
-                if not self._told:
-                    self._told = True
+                open_holds, left = await asyncio.to_thread(self._store.open)
+                latest = [] if self._opened else await asyncio.to_thread(self._store.latest, MAX_TOLD)
+                self._follower = Follower(self._silent, open_holds, left)
+                if not self._opened:
+                    self._opened = True
                     self._on_opened(latest)
             await self._write(self._follower)
         except Unwritable as error:
             self._trouble(error)
         else:
             if self._troubled is not None:
-                log.info("the journal is kept again")
+                log.info("the journal can be written again")
                 self._troubled = None
 
     async def _write(self, follower: Follower) -> None:
@@ -182,7 +188,7 @@ class Journal:
         events, self._gathered, self._weight, heard = self._gathered, [], 0, self._heard
         if self._uses and heard:
             # After the starts and ends received before.
-            events.append(UseHeard([(*word, seconds) for word, seconds in self._uses.items()]))
+            events.append(UseHeard([(*key, seconds) for key, seconds in self._uses.items()]))
             self._uses, self._used_last = {}, False
         dropped, self._dropped = self._dropped, 0
         steady = self._mesh.now() - self._set_at > STEADY
@@ -204,13 +210,13 @@ class Journal:
         if isinstance(error, Damaged):
             # The new file lacks the open holds, and the pending changes.
             self._follower, self._pending, self._first = None, [], self._wall()
-            self._said.clear()
-            self._said_count = 0
+            self._reported.clear()
+            self._reported_count = 0
             return
         self._not_before = self._mesh.now() + round(AGAIN_AFTER * SECOND)
         if self._troubled != str(error):
             self._troubled = str(error)
-            log.warning("the journal can't be kept: %s; tried again every %g s", error, AGAIN_AFTER)
+            log.warning("the journal can't be written: %s; retrying every %g s", error, AGAIN_AFTER)
 
     async def _read(self) -> None:
         try:
@@ -230,7 +236,7 @@ class Journal:
     async def _answer(self, query: IncomingQuery[HistoryAsk]) -> None:
         asked, now = query.message, self._wall()
         try:
-            # The store answers one by one: more threads of those that all share would only wait for it.
+            # The store answers one query at a time: further threads of the shared pool would only wait.
             async with self._reading:
                 answer = await asyncio.to_thread(self._store.answer, self._mesh.me.host, asked, now)
         except Unwritable as error:

@@ -56,7 +56,7 @@ _COLUMNS: Final = (
 _INSERT: Final = (
     f"INSERT INTO holds ({_COLUMNS}) VALUES ({', '.join('?' * 23)}) ON CONFLICT (term, rcm, seq) DO UPDATE SET "  # noqa: S608 - constants
 )
-# Complete a hold assumed ended, or known by its end alone.
+# Complete a hold that was assumed to have ended, or of which only the end is known.
 _BEGAN: Final = f"""{_INSERT}
     arc = excluded.arc, began = min(began, excluded.began), late = min(late, excluded.late),
     priority = excluded.priority, min_runtime = excluded.min_runtime, waited = coalesce(excluded.waited, waited),
@@ -77,7 +77,7 @@ _PARTY: Final = msgspec.json.Decoder(messages.ReasonParty)
 
 
 class Unwritable(Exception):
-    """The journal can't be kept at present; the message gives the reason. A commit may be retried."""
+    """The journal can't be written at present; the message gives the reason. A commit may be retried."""
 
 
 class Damaged(Unwritable): ...
@@ -91,10 +91,11 @@ class JournalStore:
         self._max_age, self._max_size = max_age, max_size
         self._db: sqlite3.Connection | None = None
         self._one = threading.Lock()
-        self._before = 0  # the last hold before this process, whose times are of another clock
+        self._before = 0  # the last hold before this process: its times are of another clock
 
     def open(self) -> tuple[list[Grant], float | None]:
-        """Open holds and last publication of the closed journal; sets an unreadable file aside. Raises Unwritable."""
+        """Return the open holds, and the time of the last publication, of the closed journal. An unreadable file is set
+        aside. Raises Unwritable."""
         with self._one:
             try:
                 db = self._opened()
@@ -105,7 +106,7 @@ class JournalStore:
             return [Grant(Term(term, rcm), seq) for term, rcm, seq in rows], self._fact("heard")
 
     def commit(self, changes: Iterable[Change], first: float, heard: float, now: float) -> None:
-        """Keep all changes or none, with the last publication's time; prune. Raises Unwritable."""
+        """Store all changes or none, with the last publication's time, and prune. Raises Unwritable."""
         with self._one:
             try:
                 db = self._opened()
@@ -120,7 +121,7 @@ class JournalStore:
                 raise self._failed(error) from None
 
     def answer(self, host: str, asked: messages.HistoryAsk, now: float) -> messages.History:
-        """A page. Raises Unwritable, BadName for an invalid pattern."""
+        """Answer with a page. Raises Unwritable, or BadName for an invalid pattern."""
         with self._one:
             try:
                 return self._answer(host, asked, now)
@@ -191,8 +192,8 @@ class JournalStore:
                     with suppress(FileNotFoundError):
                         self.path.with_name(FILE + end).replace(aside.with_name(ASIDE + end))
             except OSError as stays:
-                return Unwritable(f"{self.path} is damaged, and stays: {stays.strerror}")
-            log.warning("%s is damaged (%s): set aside as %s, a new one begins", self.path, error, aside.name)
+                return Unwritable(f"{self.path} is damaged, and can't be set aside: {stays.strerror}")
+            log.warning("%s is damaged (%s): set aside as %s, starting a new file", self.path, error, aside.name)
             return Damaged(f"{self.path}: {error}")
         return Unwritable(f"{self.path}: {error}")
 
@@ -207,7 +208,7 @@ class JournalStore:
         return None if row is None else float(row[0])
 
     def _prune(self, db: sqlite3.Connection, now: float) -> None:
-        """Remove the holds that ended first; the journal knows nothing before them. Open holds stay."""
+        """Remove the holds that ended first; the journal starts after them. Open holds are kept."""
         oldest = now - self._max_age
         over = "SELECT id, ended FROM holds WHERE ended IS NOT NULL"
         gone = db.execute(f"{over} AND ended < ? ORDER BY ended LIMIT ?", (oldest, PRUNED_AT_ONCE)).fetchall()

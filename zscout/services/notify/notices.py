@@ -1,4 +1,4 @@
-"""What people are told of, and in which words. Pure. A new event is a value of `NotifyEvent` and a function here."""
+"""Notifications and their texts. Pure. A new event is a value of `NotifyEvent` and a function here."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from zscout.types import SECOND, HostName, Ns, RcName, clean, span
 
 MAX_TITLE: Final = 120
 MAX_BODY: Final = 1_000
-"""Characters; what is longer is cut: much of it is others' words."""
+"""Characters; longer texts are cut, as parts of them come from other programs."""
 DAY: Final = 86_400
 
 
 class Notification(NamedTuple):
-    """`user` is whom it concerns; empty: nobody in particular."""
+    """`user` is the recipient; empty: no particular user."""
 
     event: NotifyEvent
     user: str
@@ -32,11 +32,11 @@ class Notification(NamedTuple):
 
 
 class HoldNotices:
-    """A HoldListener that notifies of grants after a wait of at least `after`, of holds that were taken away, and of
-    unwell devices."""
+    """A HoldListener that notifies of grants after a wait of at least `after`, of preempted holds, and of unwell
+    devices."""
 
-    def __init__(self, fleet: str, after: Ns, tell: Callable[[Notification], object]) -> None:
-        self._fleet, self._after, self._tell = fleet, after, tell
+    def __init__(self, fleet: str, after: Ns, notify: Callable[[Notification], object]) -> None:
+        self._fleet, self._after, self._notify = fleet, after, notify
 
     def on_began(self, began: Began) -> None:
         if not began.waited or began.waited < self._after:
@@ -44,7 +44,7 @@ class HoldNotices:
         request = began.request
         title = f"zscout {self._fleet}: {request.name} is yours now"
         body = f"{_whose(request)} holds {_listed(began.rcs)} after a wait of {span(began.waited / SECOND)}"
-        self._tell(notification("yours_now", _user(request), title, body))
+        self._notify(notification("yours_now", _user(request), title, body))
 
     def on_over(self, over: Over) -> None:
         if over.outcome is not Outcome.PREEMPTED:
@@ -53,25 +53,25 @@ class HoldNotices:
         title = f"zscout {self._fleet}: {request.name} was preempted"
         waits = "; it waits again" if over.requeued else ""
         body = f"{_whose(request)} held {_listed(over.began.rcs)} for {span(held / SECOND)}: {over.reason}{waits}"
-        self._tell(notification("preempted", _user(request), title, body))
+        self._notify(notification("preempted", _user(request), title, body))
 
     def on_unwell(self, rc: RcName, why: str, holders: Sequence[ArcRequest]) -> None:
         title = f"zscout {self._fleet}: {rc} is {'unwell' if why else 'well again'}"
         for request in holders:
             body = f"{_whose(request)} keeps it" + (f" until it is lost: {why}" if why else "")
-            self._tell(notification("device_unwell", _user(request), title, body))
+            self._notify(notification("device_unwell", _user(request), title, body))
         if not holders:
             body = f"only operators get it: {why}" if why else "it is granted again"
-            self._tell(notification("device_unwell", "", title, body))
+            self._notify(notification("device_unwell", "", title, body))
 
 
 def booking_notice(fleet: str, danger: BookedDanger) -> Notification:
-    """That a booking may not be kept, or is safe again; its date in the zone of who made it."""
+    """A booking is in danger, has lapsed, or is safe again; its date is in the owner's zone."""
     record, why, later = danger.record, danger.why, danger.later
     state = "has lapsed" if danger.over else "is in danger" if why else "is safe again"
     title = f"zscout {fleet}: your booking {record.name} {state}"
     zone: tzinfo = UTC
-    with suppress(ValueError):  # not known here
+    with suppress(ValueError):  # the zone is unknown here
         zone = zone_of(record.zone)
     at = datetime.fromtimestamp(danger.start, zone).strftime("%Y-%m-%d %H:%M %Z")
     more = f", and {later} later date{'s' * (later > 1)}" if later else ""
@@ -80,20 +80,20 @@ def booking_notice(fleet: str, danger: BookedDanger) -> Notification:
 
 
 class CertificateNotices:
-    """Tells once of each host whose certificate ends soon, for as long as it does."""
+    """Notifies once of each host whose certificate ends soon, and again after a renewal."""
 
     def __init__(self, fleet: str) -> None:
         self._fleet = fleet
-        self._told: set[HostName] = set()
+        self._notified: set[HostName] = set()
 
     def look(self, reports: Iterable[LoadReport]) -> list[Notification]:
         found = []
         for report in reports:
             left = report.certificate_ends_in
             if left is None or not report.renew:
-                self._told.discard(report.host)
-            elif report.host not in self._told:
-                self._told.add(report.host)
+                self._notified.discard(report.host)
+            elif report.host not in self._notified:
+                self._notified.add(report.host)
                 end = f"expires in {left / DAY:.1f} days" if left > 0 else "has expired"
                 title = f"zscout {self._fleet}: the certificate of {report.host} {end}"
                 found.append(notification("certificate_ends", "", title, "renew it: zscout cert renew"))
@@ -105,7 +105,7 @@ def notification(event: NotifyEvent, user: str, title: str, body: str) -> Notifi
 
 
 def _user(request: ArcRequest) -> str:
-    """By its certificate in a secured fleet; else by its own word."""
+    """The user given in the request, else the host (the certificate's name in a secured fleet)."""
     return (request.who.user if request.who is not None else "") or request.client.partition("/")[0]
 
 

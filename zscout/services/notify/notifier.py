@@ -1,5 +1,5 @@
-"""Tells people what happens, by Apprise, while this node leads. It sends in a thread of its own: a service that hangs
-holds up nobody but others that are to be told. What can't be sent is logged sparsely, and without its URL."""
+"""Notifies people by Apprise while this node leads. Notifications are sent in a thread of their own, so that a hanging
+service delays only other notifications. Failures are logged sparsely, and without the URL."""
 
 from __future__ import annotations
 
@@ -22,18 +22,18 @@ from zscout.types import SECOND, Ns
 log = logging.getLogger(__name__)
 
 QUEUE: Final = 100
-"""Notifications that wait; more are left out."""
+"""Waiting notifications; further ones are dropped."""
 PAUSES: Final = (1.0, 5.0)
 """Seconds before each further attempt."""
 REST: Final[Ns] = 60 * SECOND
-"""After its last attempt has failed a URL is sent nothing for so long, so that it does not hold up others."""
+"""After its last attempt failed, a URL is skipped for so long, so that it does not delay others."""
 LOOK: Final = 60.0
-"""Seconds between two looks at certificates."""
+"""Seconds between two checks of certificates."""
 
 
 class Notifier:
-    """`holds` is to be told of holds; `reports` gives all hosts' newest load reports while this node leads, else
-    none."""
+    """`holds` is the listener for holds; `reports` returns the newest load reports of all hosts while this node leads,
+    else none."""
 
     def __init__(
         self,
@@ -44,20 +44,20 @@ class Notifier:
         pauses: Sequence[float] = PAUSES,
         look: float = LOOK,
     ) -> None:
-        self._fleet, self.holds = fleet, HoldNotices(fleet, config.after, self.tell)
+        self._fleet, self.holds = fleet, HoldNotices(fleet, config.after, self.notify)
         self._config, self._reports, self._pauses, self._look_every = config, reports, pauses, look
         self._certificates = CertificateNotices(fleet)
         self._waiting: queue.Queue[Notification] = queue.Queue(QUEUE)
         self._stopping = threading.Event()
-        # One is written by the event loop, the other by the thread.
+        # The first is used by the event loop, the second by the thread.
         self._full, self._unsent = SparseLog(log, clock.now), SparseLog(log, clock.now)
         self._supervisor = Supervisor("the notifier", lambda _error: None)
         self._limits: dict[Address, RateLimit] = {}
         self._resting: dict[Address, Ns] = {}
-        """Until when."""
+        """End of the pause of each address."""
 
     def start(self) -> None:
-        # A daemon: a node that ends does not wait for a service that hangs.
+        # A daemon: a stopping node does not wait for a hanging service.
         threading.Thread(target=self._run, name="notifies", daemon=True).start()
         self._supervisor.call_later(self._look_every, self._look)
 
@@ -65,26 +65,26 @@ class Notifier:
         self._stopping.set()
         self._supervisor.cancel()
 
-    def tell(self, notification: Notification) -> None:
-        """Never blocks."""
+    def notify(self, notification: Notification) -> None:
+        """Queue a notification; never blocks."""
         if not self._addresses(notification):
             return
         try:
             self._waiting.put_nowait(notification)
         except queue.Full:
-            self._full.warning("", "%d notifications wait to be sent: one is left out", QUEUE)
+            self._full.warning("", "%d notifications are waiting: dropped another", QUEUE)
 
     def on_danger(self, danger: BookedDanger) -> None:
-        self.tell(booking_notice(self._fleet, danger))
+        self.notify(booking_notice(self._fleet, danger))
 
     def _addresses(self, about: Notification) -> tuple[Address, ...]:
-        heard = self._config.urls if about.event in self._config.events else ()
-        # Nobody is told twice.
-        return tuple({one.url: one for one in (*heard, *self._config.users.get(about.user, ()))}.values())
+        shared = self._config.urls if about.event in self._config.events else ()
+        # Each URL once.
+        return tuple({to.url: to for to in (*shared, *self._config.users.get(about.user, ()))}.values())
 
     def _look(self) -> None:
-        for one in self._certificates.look(self._reports()):
-            self.tell(one)
+        for expiry in self._certificates.look(self._reports()):
+            self.notify(expiry)
         self._supervisor.call_later(self._look_every, self._look)
 
     # In the thread
@@ -101,12 +101,12 @@ class Notifier:
 
     def _send(self, address: Address, notification: Notification) -> None:
         if clock.now() < self._resting.get(address, 0):
-            self._unsent.warning(address.at, "%s can't be reached: a notification is left out", address.at)
+            self._unsent.warning(address.at, "%s can't be reached: dropped a notification", address.at)
             return
         limit = self._limits.setdefault(address, RateLimit(self._config.per_minute))
         if not limit.allows(clock.now()):
             many = self._config.per_minute
-            self._unsent.warning(address.at, "%s: more than %d a minute, the rest is left out", address.at, many)
+            self._unsent.warning(address.at, "%s: more than %d a minute; dropping the rest", address.at, many)
             return
         why = self._attempt(address, notification)
         for pause in self._pauses:
@@ -116,12 +116,12 @@ class Notifier:
         if why and not self._stopping.is_set():
             self._resting[address] = clock.now() + REST
             times = 1 + len(self._pauses)
-            self._unsent.warning(address.at, "%s was not told, in %d attempts: %s", address.at, times, why)
+            self._unsent.warning(address.at, "%s was not notified in %d attempts: %s", address.at, times, why)
 
     def _attempt(self, address: Address, notification: Notification) -> str:
-        """Why it failed; empty: it did not."""
+        """Send once; return the reason of a failure, else an empty text."""
         try:
             taken = send(address.url, notification.title, notification.body)
         except NoAnswer as error:
             return str(error)
-        return "" if taken else "it did not take it"
+        return "" if taken else "the service refused it"

@@ -1,4 +1,4 @@
-"""How much one URL is sent. Pure: time is passed in."""
+"""The rate of notifications to one URL. Pure: time is passed in."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ MINUTE: Final[Ns] = 60 * SECOND
 
 
 class RateLimit:
-    """A bucket that holds `per_minute` sendings, and fills as evenly."""
+    """A token bucket for `per_minute` notifications, refilled evenly at that rate."""
 
     def __init__(self, per_minute: int) -> None:
         self._most = per_minute * MINUTE

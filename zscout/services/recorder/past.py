@@ -10,7 +10,7 @@ from operator import itemgetter
 from typing import Final, NamedTuple, TypeAlias
 
 from zscout.messages import PastHold
-from zscout.services.journal.asking import Told
+from zscout.services.journal.asking import FleetHistory
 from zscout.services.journal.merging import Span, apart, both
 from zscout.services.recorder.drawing import MAX_SLOTS, with_person
 
@@ -41,7 +41,7 @@ class Past(NamedTuple):
     gaps: Sequence[str]
 
 
-def past_of(told: Told, zero: float, seconds: float, operator_priority: int) -> Past:
+def past_of(told: FleetHistory, zero: float, seconds: float, operator_priority: int) -> Past:
     """What journals tell of so many seconds before `zero`, which is second 0. Nothing is said of when no journal was
     kept yet."""
     known = min((one.since for one in told.journals.values() if one.since is not None), default=zero)
