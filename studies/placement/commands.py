@@ -15,16 +15,16 @@ from zscout.cli.simulation.options import check_rrd, rrd_option
 
 
 @click.command()
-@seeds_option("5", "Runs of each kind: so many, or those of seeds A to B.", MAX_SEEDS)
+@seeds_option("5", "Runs of each kind: a number, or a range of seeds A-B.", MAX_SEEDS)
 @common.json_option("Print one JSON object instead of tables.")
 @rrd_option(what=" of the load curves")
 def placement(seeds: range, as_json: bool, rrd: Path | None) -> None:
-    """Compares how the load balancer's policies and metrics place components, on simulated hosts.
+    """Compare how the load balancer's policies and metrics place components, on simulated hosts.
 
     Three Place Sensor Nets on three workstations, started at once and a minute apart (Figure 3 of the paper),
-    under every policy; a mixed batch on machines of unlike speed and memory under every metric; and what
-    metric `auto` learns where one figure decides. A seed gives the same on every machine. docs/placement.md
-    says what was found.
+    under every policy; a mixed batch on machines of unlike speed and memory under every metric; and the metric
+    that `auto` learns if a single figure decides. A seed gives the same result on every machine. The results are
+    in docs/placement.md.
 
     \b
     Examples:

@@ -1,4 +1,4 @@
-"""The study of placement as a Rerun recording: a tab for each scenario, in it the hosts' load by policy."""
+"""The study of placement as a Rerun recording: a tab for each scenario with the hosts' load by policy."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ if TYPE_CHECKING:
 
 APPLICATION: Final = "zscout-study-placement"
 WIDTHS: Final = (6.0, 3.5, 1.5)
-"""Of the curves, by host: where they are the same, all can be seen."""
+"""Line width of the curves, by host, so that equal curves all remain visible."""
 TITLES: Final = {"simultaneous": "(a) all at once", "staggered": "(b) one net a minute"}
 MARKS: Final = 30
-"""Marks that would fill a plot from top to bottom: those of one moment stand above each other."""
+"""Number of marks from the bottom to the top of a plot. Marks of the same moment are stacked."""
 
 Outcomes: TypeAlias = Mapping[tuple[str, Policy], PlacementOutcome]
 Points: TypeAlias = list[tuple[Ns, float]]
 
 
 def record(path: Path, report: PlacementReport, outcomes: Outcomes) -> None:
-    """Writes the recording, replacing what was there. `outcomes` are by scenario and policy.
+    """Write the recording, and replace an existing file. `outcomes` are by scenario and policy.
 
-    Raises BadInput where the file can't be written."""
+    Raises BadInput if the file can't be written."""
     import rerun as rr
 
     with recording(path, APPLICATION, _blueprint(outcomes), _words(report)) as stream:
@@ -44,8 +44,8 @@ def record(path: Path, report: PlacementReport, outcomes: Outcomes) -> None:
 
 
 def _marks(outcome: PlacementOutcome, apart: float) -> dict[str, Points]:
-    """By host, a mark above its curve for each component, at the moment it was placed. Those of one moment
-    stand `apart`, in load average, in the order in which they were placed, so that all can be counted."""
+    """Marks by host: one above its curve for each component, at the moment of its placement. Marks of the same moment
+    are stacked `apart` in load average, in the order of placement, so that all can be counted."""
     marks: dict[str, Points] = {host: [] for host in outcome.curves}
     taken: dict[Ns, list[float]] = {}
     for component, host in outcome.placed.items():
@@ -61,13 +61,13 @@ def _marks(outcome: PlacementOutcome, apart: float) -> dict[str, Points]:
 
 
 def _top(outcomes: Outcomes, scenario: str) -> float:
-    """The highest load average of a scenario, under whatever policy: all its plots have one scale."""
+    """The highest load average of a scenario under any policy, as the common scale of its plots."""
     curves = [curve for (name, _), outcome in outcomes.items() for curve in outcome.curves.values() if name == scenario]
     return max((load for curve in curves for _, load in curve), default=1.0) or 1.0
 
 
 def _blueprint(outcomes: Outcomes) -> rrb.Blueprint:
-    """Both axes are fixed, so that the plots of a scenario show all there is, and compare."""
+    """Plots with fixed axes, so that the plots of a scenario are complete and comparable."""
     import rerun.blueprint as rrb
 
     def plot(scenario: str, policy: Policy, outcome: PlacementOutcome) -> rrb.TimeSeriesView:
@@ -99,20 +99,21 @@ def _words(report: PlacementReport) -> str:
         "# Where components go",
         f"{seeds}.",
         "",
-        "A triangle is one component: its colour says where it was placed, and it stands at the moment when.",
-        "Hosts with the same load have their curves one upon the other.",
+        "A triangle marks the placement of a component; it has the colour of its host.",
+        "The curves of hosts with the same load cover each other.",
         "",
-        "*Load apart*: highest less lowest load average, mean over the run.",
+        "*Load apart*: highest minus lowest load average, mean over the run.",
     ]
     for scenario in SCENARIOS:
         lines += ["", f"## {TITLES[scenario]}", "| policy | usual split | load apart |", "|---|---|---|"]
         lines += [
-            f"| {one.policy} | {next(iter(one.splits))} | {one.apart:.2f} |"
-            for one in report.spreads
-            if one.scenario == scenario
+            f"| {spread.policy} | {next(iter(spread.splits))} | {spread.apart:.2f} |"
+            for spread in report.spreads
+            if spread.scenario == scenario
         ]
     lines += ["", "## A mixed batch on unlike hosts", "| metric, policy | last end | mean |", "|---|---|---|"]
     lines += [
-        f"| {one.metric}, {one.policy} | {one.makespan:.0f} s | {one.completion:.0f} s |" for one in report.batches
+        f"| {batch.metric}, {batch.policy} | {batch.makespan:.0f} s | {batch.completion:.0f} s |"
+        for batch in report.batches
     ]
     return "\n".join(lines)

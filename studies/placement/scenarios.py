@@ -1,4 +1,4 @@
-"""What the study of placement plays: the paper's Figure 3, and a mixed batch on unlike machines."""
+"""Scenarios of the study of placement: the paper's Figure 3, and a mixed batch on unlike machines."""
 
 from __future__ import annotations
 
@@ -11,24 +11,24 @@ from zscout.types import SECOND, HostName, Ns
 GIGABYTE: Final = 1_000_000_000
 NETS: Final = 3
 NET_SIZE: Final = 4
-"""Components of one Place Sensor Net: as many as Scouts in it."""
+"""Components of a Place Sensor Net: one for each of its Scouts."""
 STAGGER: Final[Ns] = 60 * SECOND
 """From one Place Sensor Net to the next in scenario (b)."""
 WATCHED: Final[Ns] = 300 * SECOND
-"""How long the load curves of the sensor nets are followed."""
+"""How long the load curves of the sensor nets are recorded."""
 BATCH_SPAN: Final[Ns] = 120 * SECOND
-"""The jobs of the mixed batch come at random within it."""
+"""The jobs of the mixed batch start at random times within this span."""
 SPEEDS: Final = (1.0, 2.0, 4.0)
 MEMORIES: Final = (1 * GIGABYTE, 4 * GIGABYTE, 2 * GIGABYTE)
 
 
 def workstations() -> list[Machine]:
-    """Three of a kind, with nothing to do."""
+    """Three identical idle machines."""
     return [Machine(f"workstation{number}") for number in range(1, NETS + 1)]
 
 
 def sensor_nets(stagger: Ns = 0) -> list[SimulatedJob]:
-    """Three Place Sensor Nets, each `stagger` ns after the one before; their components run on."""
+    """Three Place Sensor Nets that start at intervals of `stagger` ns. Their components do not end."""
     return [
         SimulatedJob(f"net{net}-{number}", "place_sensor_net", SECOND + net * stagger, cpu=0.5)
         for net in range(NETS)
@@ -37,7 +37,7 @@ def sensor_nets(stagger: Ns = 0) -> list[SimulatedJob]:
 
 
 def unlike_machines(seed: int) -> list[Machine]:
-    """Speeds 1, 2, 4 with 1, 4, 2 GB. The seed deals out names, so that ties, broken by name, favour none."""
+    """Speeds 1, 2, 4 with 1, 4, 2 GB. The seed assigns names, because ties are broken by name."""
     names: list[HostName] = ["ash", "birch", "cedar"]
     Random(seed).shuffle(names)  # noqa: S311 - a simulation
     return [
@@ -46,7 +46,7 @@ def unlike_machines(seed: int) -> list[Machine]:
 
 
 def mixed_batch(seed: int) -> list[SimulatedJob]:
-    """12 that compute, 6 that fill the memory besides, 12 light ones; they come at random in two minutes."""
+    """12 jobs that compute, 6 that also fill the memory, and 12 light jobs, at random times within two minutes."""
     rng = Random(seed)  # noqa: S311 - a simulation
 
     def at() -> Ns:
@@ -65,17 +65,17 @@ def mixed_batch(seed: int) -> list[SimulatedJob]:
 
 
 FLEETS: Final = ("processor_speed", "load_average", "available_memory")
-"""Fleets of unlike machines in which this one figure decides how well a component runs."""
+"""Fleets of unlike machines in which this figure alone decides how well a component runs."""
 
 
 def deciding_fleet(decides: str, seed: int) -> tuple[list[Machine], list[SimulatedJob]]:
-    """Eight machines that differ in load and memory, and 60 jobs that come and go within ten minutes.
+    """Eight machines that differ in load and memory, and 60 jobs that start within ten minutes.
 
-    `decides`: one of `FLEETS`. Speed decides where speeds differ, processors and memory are plenty, and the load
-    average misleads: it is of processes that wait for a disk. Load decides where speeds are equal and processors few.
-    Memory decides where jobs live by files in the cache, which no profile shows, and all else is plenty."""
+    `decides` is in `FLEETS`. Speed decides if speeds differ, processors and memory are plentiful, and the load average
+    misleads because it counts processes that wait for a disk. Load decides if speeds are equal and processors few.
+    Memory decides if jobs depend on cached files, which no profile shows, and everything else is plentiful."""
     rng = Random(seed)  # noqa: S311 - a simulation
-    speed, load, memory = (decides == one for one in FLEETS)
+    speed, load, memory = (decides == figure for figure in FLEETS)
     machines = [
         Machine(
             f"host{number}",

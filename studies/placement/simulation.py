@@ -1,8 +1,8 @@
-"""Simulated machines under the balancer's own core: what the study of placement and its tests run.
+"""Simulated machines under the real balancer, for the study of placement and its tests.
 
-Machines share their processors evenly among all that want one, report once a second, each at its own moment,
-and show a one-minute load average as the kernel reckons it. A machine whose memory is too small for what runs
-on it slows all of it down. Time goes in steps of a tenth of a second.
+A machine shares its processors evenly among its components, reports once a second, each at its own moment, and has a
+one-minute load average by the kernel's formula. If its memory is too small for its components, all of them slow down.
+Time advances in steps of a tenth of a second.
 """
 
 from __future__ import annotations
@@ -20,16 +20,16 @@ from zscout.types import SECOND, ComponentId, HostName, Kind, Metric, Ns, Policy
 
 STEP: Final[Ns] = SECOND // 10
 GAIN: Final = 1 - math.exp(-STEP / LOAD_TIME)
-"""Of what wants a processor, how much one step brings into the load average."""
+"""Weight of the present demand in the load average after one step."""
 START_TIME: Final[Ns] = SECOND // 2
-"""From the word to start a component until it wants a processor, in ns."""
+"""From the order to start a component until it wants a processor, in ns."""
 LONGEST: Final[Ns] = 24 * 3600 * SECOND
 
 
 @dataclass(frozen=True, slots=True)
 class Machine:
-    """A host: `memory` in bytes; `others` is load from elsewhere, in cores; `blocked` are processes that wait
-    for a disk: they count in the load average, as on Linux, and take no processor."""
+    """A host: `memory` in bytes; `others` is other load, in cores; `blocked` processes wait for a disk: they count in
+    the load average, as on Linux, and use no processor."""
 
     name: HostName
     cores: float = 1.0
@@ -41,12 +41,12 @@ class Machine:
 
 @dataclass(frozen=True, slots=True)
 class SimulatedJob:
-    """A component that is started at `at` ns and takes `memory` bytes. It reads `cache` bytes of files over
-    and over; they are no memory of its own, and it is slow where there is no room to keep them.
+    """A component that starts at `at` ns and needs `memory` bytes. It reads `cache` bytes of files repeatedly; they are
+    not its own memory, but it is slow where they do not fit into the file cache.
 
-    It keeps a pace and wants `cpu` cores of speed 1.0, so less of a faster one; or, if `greedy`, it computes
-    all the time in `cpu` threads, and gets more done on a faster one. It ends when it has had `work`
-    core-seconds at speed 1.0; None: never."""
+    It works at a constant pace and wants `cpu` cores of speed 1.0, so fewer on a faster machine. If `greedy`, it
+    computes all the time in `cpu` threads, and does more on a faster machine. It ends after `work` core-seconds at
+    speed 1.0; None: never."""
 
     component: ComponentId
     kind: Kind
@@ -58,13 +58,13 @@ class SimulatedJob:
     cache: int = 0
 
     def wants(self, speed: float) -> float:
-        """Cores that it wants of a machine of this speed."""
+        """Cores that it wants on a machine of this speed."""
         return self.cpu if self.greedy else self.cpu / speed
 
 
 @dataclass(slots=True)
 class PlacementOutcome:
-    """Where each component ran, when it ended, and each machine's load average, once a second."""
+    """The host and end of each component, and each machine's load average once a second."""
 
     placed: dict[ComponentId, HostName] = field(default_factory=dict)
     placed_at: dict[ComponentId, Ns] = field(default_factory=dict)
@@ -74,16 +74,16 @@ class PlacementOutcome:
     """The metric that each placement used, in order."""
 
     def spread(self) -> int:
-        """Difference between the hosts that were given most and fewest components."""
+        """Difference between the largest and the smallest number of components on a host."""
         counts = self.counts()
         return max(counts) - min(counts)
 
     def counts(self) -> list[int]:
-        """Components that each host was given, in the order of `curves`."""
+        """Number of components placed on each host, in the order of `curves`."""
         return [list(self.placed.values()).count(host) for host in self.curves]
 
     def apart(self) -> float:
-        """How far the load curves are apart: highest less lowest load average, its mean over the run."""
+        """Distance of the load curves: highest minus lowest load average, mean over the run."""
         moments = list(zip(*(curve for curve in self.curves.values()), strict=True))
         gaps = [max(load for _, load in now) - min(load for _, load in now) for now in moments]
         return sum(gaps) / len(gaps) if gaps else 0.0
@@ -106,23 +106,23 @@ class _Host:
     number: int = 0
 
     def step(self, now: Ns) -> list[_Running]:
-        """One step of time; returns who has ended in it."""
+        """Advance by one step. Return the components that ended in it."""
         speed = self.machine.speed
         share, wanting = self.share(now)
         self.load += (wanting + self.machine.blocked - self.load) * GAIN
         ended = []
-        for one in self.running:
-            if one.begins <= now:
-                one.done += one.job.wants(speed) * speed * share * STEP / SECOND
-                if one.job.work is not None and one.done >= one.job.work:
-                    ended.append(one)
-        for one in ended:
-            self.running.remove(one)
+        for component in self.running:
+            if component.begins <= now:
+                component.done += component.job.wants(speed) * speed * share * STEP / SECOND
+                if component.job.work is not None and component.done >= component.job.work:
+                    ended.append(component)
+        for component in ended:
+            self.running.remove(component)
         return ended
 
     def share(self, now: Ns) -> tuple[float, float]:
-        """What part of what it wants each component gets, and how many cores all want."""
-        active = [one.job for one in self.running if one.begins <= now]
+        """The part of its demand that each component gets, and the demand of all in cores."""
+        active = [component.job for component in self.running if component.begins <= now]
         wanting = self.machine.others + sum(job.wants(self.machine.speed) for job in active)
         memory = sum(job.memory + job.cache for job in active)
         fits = 1.0 if memory <= self.machine.memory else max(THRASHING, (self.machine.memory / memory) ** 2)
@@ -132,7 +132,7 @@ class _Host:
         machine = self.machine
         share, wanting = self.share(now)
         self.number += 1
-        active = [one.job for one in self.running if one.begins <= now]
+        active = [component.job for component in self.running if component.begins <= now]
         return LoadReport(
             host=machine.name,
             number=self.number,
@@ -159,17 +159,17 @@ def simulate(
     until: Ns | None = None,
     balancer: Balancer | None = None,
 ) -> PlacementOutcome:
-    """Starts the jobs at their times, each on the host that the balancer ranks first, and lets all run until
-    `until`, or until the last has ended. `balancer`: one that has learnt before; it has no reports yet.
+    """Start the jobs at their times, each on the host that the balancer ranks first, and run until `until`, or until
+    the last has ended. `balancer` may have learnt in an earlier run; it has no reports yet.
 
-    Raises ValueError if it would never end, or has not ended after a day."""
+    Raises ValueError if the run would never end, or has not ended after a day."""
     if until is None and any(job.work is None for job in jobs):
         raise ValueError("a job without an end needs `until`")
     rng = Random(seed)  # noqa: S311 - a simulation
     balancer = balancer or Balancer(rng)
     hosts = {
-        one.name: _Host(one, rng.randrange(REPORT_EVERY // STEP) * STEP, load=one.others + one.blocked)
-        for one in machines
+        machine.name: _Host(machine, rng.randrange(REPORT_EVERY // STEP) * STEP, load=machine.others + machine.blocked)
+        for machine in machines
     }
     outcome = PlacementOutcome(curves={name: [] for name in hosts})
     for host in hosts.values():

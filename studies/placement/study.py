@@ -1,4 +1,4 @@
-"""The study of placement: what policies and metrics come to, over seeds. A seed is the same everywhere."""
+"""The study of placement: policies and metrics compared over seeds. A seed gives the same result everywhere."""
 
 from __future__ import annotations
 
@@ -23,22 +23,22 @@ from zscout.placement.balancer import Balancer
 from zscout.types import METRICS, POLICIES, SECOND, Metric, Ns, Policy
 
 SCENARIOS: Final[Mapping[str, Ns]] = {"simultaneous": 0, "staggered": STAGGER}
-"""The paper's Figure 3 (a) and (b): from one Place Sensor Net to the next, in ns."""
+"""The paper's Figure 3 (a) and (b): interval between the Place Sensor Nets in ns."""
 FIGURE_METRIC: Final[Metric] = "load_average"
 BASELINE: Final[tuple[Metric, Policy]] = ("load_average", "least_loaded")
-"""What batches are compared with: the paper's balancer."""
+"""The paper's balancer, with which batches are compared."""
 BATCHES: Final[tuple[tuple[Metric, Policy], ...]] = (BASELINE, *((metric, "pending") for metric in METRICS))
 LATEST: Final = 20
-"""Placements of a fleet by which `auto` is judged: the last ones."""
+"""Number of last placements in a fleet by which `auto` is judged."""
 
 
 @dataclass(frozen=True, slots=True)
 class PolicySpread:
     """Three Place Sensor Nets on three workstations under one policy, over all seeds.
 
-    `splits`: how many seeds came to each split of the components, the fullest host first. `used_all`, `even`:
-    seeds in which each host got some, and in which hosts were within one of each other. `apart`: highest less
-    lowest load average, mean over time and seeds."""
+    `splits`: number of seeds by split of the components, the fullest host first. `used_all`: seeds in which every host
+    got components. `even`: seeds in which the hosts' counts differed by at most 1. `apart`: highest minus lowest load
+    average, mean over time and seeds."""
 
     scenario: str
     policy: Policy
@@ -50,8 +50,8 @@ class PolicySpread:
 
 @dataclass(frozen=True, slots=True)
 class Batch:
-    """The mixed batch on unlike machines: means over seeds, in seconds. `makespan`: until the last has ended;
-    `completion`: from a component's start to its end. The gains are against `BASELINE`, from 0 to 1."""
+    """The mixed batch on unlike machines: means over seeds, in seconds. `makespan`: until the last end; `completion`:
+    from a component's start to its end. The gains are relative to `BASELINE`, at most 1."""
 
     metric: Metric
     policy: Policy
@@ -63,8 +63,8 @@ class Batch:
 
 @dataclass(frozen=True, slots=True)
 class Learnt:
-    """What metric `auto` came to in a fleet where the figure `decides`: by which metric it made most of the
-    last placements, in how many seeds, and its explanation in the end, in the first seed."""
+    """The choice of metric `auto` in a fleet where the figure `decides`. `used`: number of seeds by the metric of most
+    of the last placements. `why`: its explanation at the end of the first seed."""
 
     decides: str
     used: Mapping[Metric, int]
@@ -87,8 +87,7 @@ def parts() -> int:
 def study(
     seeds: Sequence[int], advance: Callable[[], None] = lambda: None
 ) -> tuple[PlacementReport, dict[tuple[str, Policy], PlacementOutcome]]:
-    """Plays everything, and returns the first seed's outcomes by scenario and policy too. Raises ValueError
-    where there is no seed."""
+    """Run everything. Also return the first seed's outcomes by scenario and policy. Raises ValueError without seeds."""
     if not seeds:
         raise ValueError("a study needs a seed")
     spreads, first = [], {}
@@ -106,7 +105,7 @@ def study(
         for seed in seeds:
             times.append(batch(metric, policy, seed))
             advance()
-        makespan, completion = (_mean([one[at] for one in times]) for at in range(2))
+        makespan, completion = (_mean([run[at] for run in times]) for at in range(2))
         base = batches[0] if batches else None
         gains = [1 - makespan / base.makespan, 1 - completion / base.completion] if base else [0.0, 0.0]
         batches.append(Batch(metric, policy, makespan, completion, *gains))
@@ -146,14 +145,14 @@ def learn(decides: str, seed: int) -> tuple[Metric, str]:
 
 
 def _spread(scenario: str, policy: Policy, outcomes: Sequence[PlacementOutcome]) -> PolicySpread:
-    splits = Counter("-".join(str(count) for count in sorted(one.counts(), reverse=True)) for one in outcomes)
+    splits = Counter("-".join(str(count) for count in sorted(outcome.counts(), reverse=True)) for outcome in outcomes)
     return PolicySpread(
         scenario,
         policy,
         dict(sorted(splits.items(), key=lambda split: (-split[1], split[0]))),
-        used_all=sum(min(one.counts()) > 0 for one in outcomes),
-        even=sum(one.spread() <= 1 for one in outcomes),
-        apart=_mean([one.apart() for one in outcomes]),
+        used_all=sum(min(outcome.counts()) > 0 for outcome in outcomes),
+        even=sum(outcome.spread() <= 1 for outcome in outcomes),
+        apart=_mean([outcome.apart() for outcome in outcomes]),
     )
 
 

@@ -1,4 +1,4 @@
-"""What `python -m studies placement` prints for people."""
+"""Tables of `python -m studies placement`."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ def print_report(report: PlacementReport) -> None:
             ["policy", "all hosts used", "within one", "load apart", "components on each (seeds)"],
             [
                 [
-                    one.policy,
-                    f"{one.used_all} of {report.seeds}",
-                    f"{one.even} of {report.seeds}",
-                    f"{one.apart:.2f}",
-                    _splits(one.splits),
+                    spread.policy,
+                    f"{spread.used_all} of {report.seeds}",
+                    f"{spread.even} of {report.seeds}",
+                    f"{spread.apart:.2f}",
+                    _splits(spread.splits),
                 ]
-                for one in report.spreads
-                if one.scenario == scenario
+                for spread in report.spreads
+                if spread.scenario == scenario
             ],
             title=f"{title}: 12 components of three Place Sensor Nets on three workstations, by load_average",
         )
@@ -35,25 +35,25 @@ def print_report(report: PlacementReport) -> None:
         ["metric", "policy", "last end", "sooner", "mean completion", "sooner"],
         [
             [
-                one.metric,
-                one.policy,
-                f"{one.makespan:.0f} s",
-                f"{one.makespan_gain:+.0%}",
-                f"{one.completion:.1f} s",
-                f"{one.completion_gain:+.0%}",
+                batch.metric,
+                batch.policy,
+                f"{batch.makespan:.0f} s",
+                f"{batch.makespan_gain:+.0%}",
+                f"{batch.completion:.1f} s",
+                f"{batch.completion_gain:+.0%}",
             ]
-            for one in report.batches
+            for batch in report.batches
         ],
         title="30 components, some heavy, some large, some light, on speeds 1, 2, 4 with 1, 4, 2 GB",
     )
     terminal.print_line("")
     terminal.print_table(
-        ["what decides", "auto used (seeds)", "what it says in the first"],
+        ["deciding figure", "auto used (seeds)", "its explanation in the first"],
         [
-            [one.decides, ", ".join(f"{metric} ({seeds})" for metric, seeds in one.used.items()), one.why]
-            for one in report.learnt
+            [fleet.decides, ", ".join(f"{metric} ({seeds})" for metric, seeds in fleet.used.items()), fleet.why]
+            for fleet in report.learnt
         ],
-        title="What metric auto learns where one figure decides: its last 20 of 60 placements",
+        title="Metric auto where a single figure decides: its last 20 of 60 placements",
     )
 
 

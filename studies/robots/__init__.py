@@ -1,1 +1,1 @@
-"""Closed loops under virtual time: the building, the controller and what stands between them, without a mesh."""
+"""Closed loops under virtual time, without a mesh: the building, the controller and the link between them."""

@@ -16,7 +16,7 @@ from zscout.cli.simulation.options import check_rrd, rrd_option
 from zscout.config.strict import BadInput
 
 MAX_NETS: Final = 5_000
-"""Runs at most: at ten seconds each they take half a day."""
+"""Most runs: at ten seconds each they take half a day."""
 MAX_CREW: Final = 16
 MAX_BAUD: Final = 1_000_000
 MIN_BAUD: Final = 110
@@ -24,7 +24,7 @@ MAX_SLOT: Final = 3_600
 
 
 @click.command()
-@seeds_option("2", "Runs of each kind in each building: so many, or those of seeds A to B.", MAX_SEEDS)
+@seeds_option("2", "Runs of each kind in each building: a number, or a range of seeds A-B.", MAX_SEEDS)
 @numbers_option("--robots", 1, MAX_CREW, "How many robots, as in 1-4,8. Default: 1,2,4,6,8.")
 @numbers_option("--channels", 1, MAX_CREW, "How many video channels, with a framegrabber each. Default: 1-4.")
 @numbers_option("--framegrabbers", 1, 4, "How many framegrabbers for four robots and four channels. Default: 1-4.")
@@ -35,16 +35,14 @@ MAX_SLOT: Final = 3_600
     "buildings",
     multiple=True,
     metavar="NAME|FILE",
-    help="One that is shipped, `drawn` (another one for each seed), or a TOML file; repeat it for several. "
+    help="A shipped building, `drawn` (a random building for each seed), or a TOML file; repeat it for several. "
     "Default: all shipped, and drawn.",
 )
-@click.option(
-    "--seconds", type=seconds_within(1, 3_600), default="180", help="Of the building, that each run takes: 90s, 5m."
-)
+@click.option("--seconds", type=seconds_within(1, 3_600), default="180", help="Virtual time of each run: 90s, 5m.")
 @click.option(
     "--starts",
     type=click.IntRange(1, MAX_SEEDS),
-    help="Instead: so many random starts of one robot in each building, 120 s each.",
+    help="Instead: this number of random starts of one robot in each building, 120 s each.",
 )
 @jobs_option
 @common.json_option("Print one JSON object instead of tables; it has every run as well.")
@@ -53,7 +51,7 @@ MAX_SLOT: Final = 3_600
     "--svg",
     type=click.Path(path_type=Path, file_okay=False, exists=True),
     metavar="FOLDER",
-    help="Write the plots as SVG files into this folder besides.",
+    help="Also write the plots as SVG files into this folder.",
 )
 def robots(
     seeds: range,
@@ -70,13 +68,12 @@ def robots(
     rrd: Path | None,
     svg: Path | None,
 ) -> None:
-    """Measures Place Sensor Net in simulated buildings: how soon robots are hidden, and what they then see.
+    """Measure Place Sensor Net in simulated buildings: how soon robots are hidden, and how much they then see.
 
-    Against the number of robots and of video channels with a framegrabber each; against the number of
-    framegrabbers, and the rate of the radio, with four robots and four channels; and against the length of their
-    turns, with four robots on one channel. Whatever of --robots, --channels, --framegrabbers, --baud and --slot is
-    given, only that is tried. Mind, votes and scheduling are those that run live; the mesh is left out, and time is
-    virtual. docs/robots.md says what was found.
+    By number of robots and of video channels with a framegrabber each; by number of framegrabbers, and by rate of
+    the radio, with four robots and four channels; and by length of the turns, with four robots on one channel. If
+    any of --robots, --channels, --framegrabbers, --baud and --slot is given, only these are tried. Controllers, votes
+    and scheduling are the real code; the mesh is left out, and time is virtual. The results are in docs/robots.md.
 
     \b
     Examples:
@@ -93,9 +90,9 @@ def robots(
 
     names = list(dict.fromkeys(buildings)) or nets.buildings()
     for name in names:
-        # Those that are drawn have robots.
+        # Drawn buildings have robots.
         if name != nets.DRAWN and not nets.plan_of(name, 0).robots and starts is not None:
-            raise BadInput(f"--building {name}: there is no robot in it to start; add a [[robot]]")
+            raise BadInput(f"--building {name}: it has no robot to start; add a [[robot]]")
     plan = nets.StudyPlan()
     if starts is None:
         plan = nets.StudyPlan.of(robots or [], channels or [], framegrabbers or [], baud or [], slot or [])
@@ -113,6 +110,6 @@ def robots(
         from studies.robots.svg import write
 
         write(svg, found.grid, found.radio)
-    # Not `asdict`: in Python 3.11 it takes counters apart.
-    shown = {one.name: getattr(found, one.name) for one in dataclasses.fields(found)} | {"runs": trials}
+    # Not `asdict`, which fails on counters in Python 3.11.
+    shown = {field.name: getattr(found, field.name) for field in dataclasses.fields(found)} | {"runs": trials}
     show(shown, rrd, partial(print_report, found, names, len(numbers), seconds), as_json=as_json)

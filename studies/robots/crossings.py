@@ -1,5 +1,5 @@
-"""Where the crossings of a sensor net go: of each person who walks through what a placed robot would see, whether it
-was told in time, and if not, why. Judged by the building's own truth, which no robot knows."""
+"""The fates of crossings in a sensor net: for each person who walks through a placed robot's field of view, whether the
+robot alerted in time, and if not, why. Judged by the building's ground truth, which no robot knows."""
 
 from __future__ import annotations
 
@@ -16,26 +16,26 @@ from zscout.simulation.building.world import World
 Fate: TypeAlias = Literal[
     "in time", "off the air", "warming up", "not hidden", "no picture", "learning", "told late", "not told"
 ]
-"""Of one crossing. What is not *in time* has the first that was in its way as it began: the robot's transmitter was
-off; its camera was warming up; it was not where it had hidden, or was still looking whether it is; its picture was bad;
-its background was being learned; nothing was, and it was told late or not at all."""
+"""The fate of a crossing. If it is not *in time*, this is the first obstacle as the crossing began: the transmitter was
+off; the camera was warming up; the robot was not at its hidden place, or still checked whether it was; its picture was
+bad; it was learning its background. Without an obstacle the alert was late or missing."""
 FATES: Final[tuple[Fate, ...]] = get_args(Fate)
 _AWAY: Final = frozenset[Fate | None]({"off the air", "warming up"})
 LOOK: Final = 0.25
-"""Seconds between two looks at who is in view."""
+"""Seconds between two checks for people in view."""
 MOVED, TURNED = 0.1, 0.2
-"""Metres and radians by which a robot may be off its place and still be there."""
+"""Metres and radians by which a robot at its place may deviate from it."""
 
 
 @dataclass(slots=True)
 class CrossingsOf:
-    """Those of one robot's place."""
+    """Crossings of one robot's place."""
 
     fates: Counter[Fate] = field(default_factory=Counter)
     could: int = 0
-    """Of these: began while its camera was warm, and it was on the air for as long as there was to tell it in."""
+    """Crossings that could be in time: the camera was warm, and on the air until the time limit."""
     told: int = 0
-    """Of those that could: in time."""
+    """Crossings in time among crossings that could be."""
 
     @property
     def all(self) -> int:
@@ -43,11 +43,11 @@ class CrossingsOf:
 
     @property
     def in_time(self) -> float:
-        """Share of all; NaN of none."""
+        """Share of crossings in time; NaN without crossings."""
         return self.fates["in time"] / self.all if self.all else math.nan
 
     def add(self, other: CrossingsOf) -> None:
-        """Makes it the sum of both."""
+        """Add the counts of `other`."""
         self.fates += other.fates
         self.could += other.could
         self.told += other.told
@@ -55,31 +55,31 @@ class CrossingsOf:
 
 @dataclass(slots=True)
 class _Place:
-    """Where a robot last was hidden by its own word, and who crosses what it sees from there."""
+    """The last place where a robot reported to be hidden, and the present crossing of its view from there."""
 
     pose: Pose
     obstacle: Fate | None = None
-    """What was in the way as the present crossing began."""
+    """The obstacle as the present crossing began."""
     since: float | None = None
-    """When that was; None: nobody is in view."""
+    """When the present crossing began; None: no person is in view."""
     last_person: float = -math.inf
     told_at: float | None = None
 
 
 class Crossings:
-    """Follows one run. `found` is by robot; one that was never hidden has no place."""
+    """The crossings of a run. `found` is by robot; a robot that was never hidden has no place."""
 
     def __init__(self, world: World, robots: list[str]) -> None:
         self.found = {robot: CrossingsOf() for robot in robots}
         self._world = world
         self._places: dict[str, _Place] = {}
         self._doing: dict[str, Fate | None] = {}
-        """What keeps each robot that is held from telling of a crossing, as it looked last. One that has not looked is
-        not held, though its transmitter may take a moment to hear of that."""
+        """By held robot: what kept it from reporting a crossing at its last look. Robots without a look are not held,
+        though their transmitters may be on for a moment longer."""
         self._looked = 0.0
 
     def hidden(self, robot: str) -> None:
-        """It is hidden by its own word, and stands still."""
+        """The robot reports that it is hidden, and does not move."""
         place, pose = self._places.get(robot), self._world.bodies[robot].pose
         if place is None:
             self._places[robot] = _Place(pose)
@@ -88,8 +88,8 @@ class Crossings:
             self._places[robot] = _Place(pose)
 
     def looked(self, robot: str, *, watches: bool, picture: bool, learning: bool, alert: bool) -> None:
-        """It has looked, under its hold: whether it watches, had a good picture, learns its background, tells of
-        motion."""
+        """A look of a held robot: whether it `watches`, had a good `picture`, is `learning` its background, and gives
+        an `alert`."""
         if not watches:
             self._doing[robot] = "not hidden"
         elif not picture:
@@ -101,7 +101,7 @@ class Crossings:
             place.told_at = self._world.time
 
     def stepped(self) -> None:
-        """The building went on."""
+        """The building advanced by a step."""
         now = self._world.time
         if now - self._looked < LOOK:
             return
@@ -126,10 +126,10 @@ class Crossings:
         return self._doing[robot]
 
     def _close(self, robot: str, place: _Place) -> None:
-        """The crossing is over, if there is one."""
+        """Count the present crossing, if any: it is over."""
         if place.since is None:
             return
-        # He was in view for half of a look, as a mean, before that was seen here.
+        # On average the person was in view for half of LOOK before `since`.
         in_time = place.told_at is not None and place.told_at - place.since <= IN_TIME - LOOK / 2
         if in_time:
             fate: Fate = "in time"
@@ -142,7 +142,7 @@ class Crossings:
         place.since = None
 
     def ended(self, robot: str) -> None:
-        """Its hold is over."""
+        """The robot's hold has ended."""
         self._doing.pop(robot, None)
         place = self._places.get(robot)
         if place is None or place.since is None or place.told_at is not None:
@@ -151,7 +151,7 @@ class Crossings:
             place.obstacle = "off the air"
 
 
-def same_place(one: Pose, other: Pose) -> bool:
-    """Whether a robot that stands here has not left that place."""
-    apart = math.hypot(one.x - other.x, one.y - other.y)
-    return apart <= MOVED and abs(math.remainder(one.heading - other.heading, math.tau)) <= TURNED
+def same_place(here: Pose, other: Pose) -> bool:
+    """Return True if a robot at `here` has not left the place `other`."""
+    apart = math.hypot(here.x - other.x, here.y - other.y)
+    return apart <= MOVED and abs(math.remainder(here.heading - other.heading, math.tau)) <= TURNED

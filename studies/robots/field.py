@@ -1,8 +1,8 @@
 """A sensor net in a building under virtual time: many robots, few framegrabbers and channels, one radio.
 
-Everything that decides is what decides live: the scheduling core, the radio's and the channels' votes, each
-robot's `Scout`. Only the mesh between them is left out: a command takes LATENCY and then its time on the
-radio's line. The outcome of a run is when each robot was placed, and how much of what moved was seen.
+All decisions are made by the real code: the scheduling core, the votes of the radio and the channels, each robot's
+`Scout`. Only the mesh is left out: a command takes LATENCY and its time on the radio's line. The outcome of a run is
+when each robot was placed, and how much of the motion was seen.
 """
 
 from __future__ import annotations
@@ -50,21 +50,21 @@ from zscout.types import SECOND, ArcId, Ns, Params
 
 MAX_CHANNELS: Final = 16
 LATENCY: Final = 0.1
-"""Seconds from a picture to the command's coming to the radio: transmission, thinking, the mesh."""
+"""Seconds from a picture to the arrival of its command at the radio: transmission, computation, the mesh."""
 REPEAT: Final = 0.2
-"""Seconds after which a stop, halt or camera command that was lost is sent again."""
+"""Seconds after which a lost stop, halt or camera command is sent again."""
 BOUND: Final = Fraction(1, 4)
-"""Seconds that a packet may wait at the radio ..."""
+"""Seconds that a packet may wait at the radio, or the time of BOUND_BYTES if that is longer."""
 BOUND_BYTES: Final = 60
-"""... or as long as so many bytes take, as in the node file of `zscout simulate`."""
+"""As in the node file of `zscout simulate`."""
 RADIO: Final = "radio/rf0"
 _SOON: Final = 1e-6
-"""Seconds that are no difference."""
+"""Seconds below which times are equal."""
 
 
 @dataclass(frozen=True, slots=True)
 class Field:
-    """What there is to work with. Raises ValueError for what can't be."""
+    """The equipment of a run. Raises ValueError for impossible numbers."""
 
     robots: int = 4
     channels: int = 2
@@ -73,24 +73,24 @@ class Field:
     """0: one for each channel."""
     baud: int = 9_600
     command_rate: float = 5.0
-    """Drive packets a second that each robot's behavior asks for."""
+    """Drive packets a second that each robot's behavior requests."""
     frame_rate: float = 4.0
-    """Pictures a second that a framegrabber gives: few, as they are most of the work."""
+    """Pictures a second of a framegrabber: few, because they take most of the computing time."""
     loss: float = 0.02
     """Share of radio packets that are lost."""
     slots: Slots = field(default_factory=Slots)
 
     def __post_init__(self) -> None:
         if not 1 <= self.robots <= MAX_ROBOTS or not 1 <= self.channels <= MAX_CHANNELS:
-            raise ValueError(f"1 to {MAX_ROBOTS} robots and 1 to {MAX_CHANNELS} channels are taken")
+            raise ValueError(f"give 1 to {MAX_ROBOTS} robots and 1 to {MAX_CHANNELS} channels")
         if not 0 <= self.framegrabbers <= self.channels:
-            raise ValueError(f"framegrabbers are 1 to the {self.channels} channels, or 0 for one each")
+            raise ValueError(f"give 1 to {self.channels} framegrabbers, or 0 for one per channel")
         if self.baud < 1 or self.command_rate <= 0 or self.frame_rate <= 0 or not 0 <= self.loss < 1:
-            raise ValueError("rates are above 0, the loss is 0 or more and below 1")
+            raise ValueError("rates must be above 0, the loss at least 0 and below 1")
 
     @property
     def receivers(self) -> int:
-        """How many framegrabbers there are."""
+        """Number of framegrabbers."""
         return self.framegrabbers or self.channels
 
     @property
@@ -100,7 +100,7 @@ class Field:
 
 
 def crewed(plan: Plan, robots: int, *, seed: int = 0) -> Plan:
-    """The same building with so many robots: its own first ones, or as `with_robots` draws them."""
+    """The same building with this number of robots: the plan's first, or drawn by `with_robots`."""
     if robots <= len(plan.robots):
         return msgspec.structs.replace(plan, robots=plan.robots[:robots])
     return with_robots(plan, robots, seed=seed)
@@ -114,41 +114,41 @@ class Player:
         self.asked: ArcId | None = None
         self.held: Granted | None = None
         self.warm: ArcId | None = None
-        """What was asked for to warm its camera up before its turn."""
+        """The request for warming up its camera before its turn."""
         self.warmed: Granted | None = None
-        """That hold, while it lasts."""
+        """The hold of `warm`, while it lasts."""
         self.transmits: Granted | None = None
         """The last hold whose command to transmit the robot has received."""
         self.video: str | None = None
-        """The channel that it asked for by name."""
+        """The channel that it requested by name."""
         self.turns = 0
         self.asks_at: float | None = 0.0
-        """When it asks anew; None while it waits or holds."""
+        """When it requests again; None while it waits or holds."""
         self.warms_at: float | None = None
-        """When its camera is to begin to warm up."""
+        """When its camera starts to warm up."""
         self.next_picture = 0.0
         self.next_drive = 0.0
         self.stood = False
-        """Whether the last command of this hold is a stop."""
+        """True if the last command of this hold was a stop."""
 
     @property
     def channel(self) -> int:
-        """The number of the video channel that it holds. Raises RuntimeError where it holds nothing."""
+        """The number of the held video channel. Raises RuntimeError without a hold."""
         if self.held is None:
             raise RuntimeError(f"{self.name} holds nothing")
         return _channel(self.held)
 
 
 def _channel(hold: Granted) -> int:
-    """The number of its video channel."""
+    """The number of the hold's video channel."""
     return next(int(rc.removeprefix("video/ch")) for rc in hold.rcs if rc.startswith("video/"))
 
 
 class FieldRun:
-    """One net in one building. `run` it once."""
+    """A net in a building. Can `run` only once."""
 
     def __init__(self, plan: Plan, field: Field, *, seed: int = 0) -> None:
-        """Puts the plan's robots on random places; raises ValueError where it has not `field.robots`."""
+        """Put the plan's robots on random places. Raises ValueError if their number is not `field.robots`."""
         names = [robot.name for robot in plan.robots]
         if len(names) != field.robots:
             raise ValueError(f"{plan.name} has {len(names)} robots, not {field.robots}: see crewed()")
@@ -177,7 +177,7 @@ class FieldRun:
         )
 
     def run(self, seconds: float, *, watch: Callable[[FieldRun], None] | None = None) -> Outcomes:
-        """Plays so many seconds of the building. `watch` is called after each step."""
+        """Play for `seconds` of virtual time. `watch` is called after each step."""
         while self.world.time < seconds - _SOON:
             now = self.world.time
             dt = min(self._next() - now, MAX_STEP, seconds - now)
@@ -186,7 +186,7 @@ class FieldRun:
             else:
                 dt = 0.0
             self._play()
-            alarm = any(one.scout.alerts.moving and one.held for one in self.players.values())
+            alarm = any(player.scout.alerts.moving and player.held for player in self.players.values())
             self._judge.stepped(dt, alarm=alarm)
             if watch is not None:
                 watch(self)
@@ -194,7 +194,7 @@ class FieldRun:
         return self.outcomes
 
     def _next(self) -> float:
-        """When something happens next, beside the building's own doing."""
+        """The time of the next event outside the building."""
         times = [self._wake / SECOND]
         times += [self._under_way[0][0]] if self._under_way else []
         for player in self.players.values():
@@ -205,7 +205,7 @@ class FieldRun:
         return min(times)
 
     def _play(self) -> None:
-        """All that is due."""
+        """Play all due events."""
         now = self.world.time
         while self._under_way and self._under_way[0][0] <= now + _SOON:
             heapq.heappop(self._under_way)[2]()
@@ -238,7 +238,7 @@ class FieldRun:
         self._handle(Requested(request))
 
     def _needs(self, player: Player) -> dict[str, Params]:
-        """What it needs to transmit."""
+        """The needs of a robot that transmits."""
         return {
             f"robot/{player.name}": {},
             RADIO: {"command_rate": Fraction(str(self.field.command_rate)), "packet_size": Fraction(MAX_PACKET)},
@@ -246,19 +246,23 @@ class FieldRun:
         }
 
     def _warm_up(self, player: Player) -> None:
-        """Its turn is near, and its camera is to be warm by then."""
+        """Request the robot for warming up its camera before its turn."""
         player.warms_at, player.warm = None, f"{player.name}-warm.{player.turns}"
         self._by_arc[player.warm] = player
         priority, runtime = self.field.slots.warm_priority, round(BRIEF * SECOND)
         request = ArcRequest(player.warm, player.name, self._needs(player), priority, runtime, keep=True)
         self._handle(Requested(request))
 
-    def _foresee(self) -> list[Event]:
-        """When cameras are to begin to warm up; what ends where their turns have gone away again. `place_robot` goes
-        by such a forecast."""
+    def _schedule_warm_ups(self) -> list[Event]:
+        """Set when cameras start to warm up, by a forecast of turns as in `place_robot`. Return the ends of warm-ups
+        whose turns have moved away again."""
         now = self.world.time
-        waiting = [one for one in self.players.values() if one.held is None and one.asked and one.asks_at is None]
-        waiting = [one for one in waiting if one.scout.task == "watch"]
+        waiting = [
+            player
+            for player in self.players.values()
+            if player.held is None and player.asked and player.asks_at is None
+        ]
+        waiting = [player for player in waiting if player.scout.task == "watch"]
         starts = forecast(self._core, round(now * SECOND)).starts if waiting else {}
         over: list[Event] = []
         for player in waiting:
@@ -274,15 +278,15 @@ class FieldRun:
         return over
 
     def _handle(self, *events: Event) -> None:
-        """What comes of events at the RCM, and of what follows from them."""
+        """Handle events at the RCM, and the events that follow from them."""
         left = self._instant(*events)
         while left:
             left = self._instant(*left)
-        if self.field.receivers < self.field.channels and (over := self._foresee()):
+        if self.field.receivers < self.field.channels and (over := self._schedule_warm_ups()):
             self._handle(*over)
 
     def _instant(self, *events: Event) -> list[Event]:
-        """One instant at the RCM, with every vote that it takes; and what its clients give up then."""
+        """Handle an instant at the RCM with all its votes. Return the clients' cancellations that follow."""
         batch: list[Event] = list(events)
         warmed = [player for player in self.players.values() if player.warmed is not None]
         now: Ns = round(self.world.time * SECOND)
@@ -294,7 +298,7 @@ class FieldRun:
                     case Propose():
                         votes.append(self._vote(effect))
                     case WakeAt(at=at):
-                        # Nothing to wake for: a day from now.
+                        # No wake-up is needed: a day from now.
                         self._wake = now + 86_400 * SECOND if at is None else at
                         again = at is not None and at <= now
                     case _:
@@ -305,7 +309,7 @@ class FieldRun:
             if player in warmed and player.held is None and player.warmed is None:
                 self._halt(player)
             if player.warm is not None and player.held is not None:
-                # Its turn has come before it was warm.
+                # Its turn came before the camera was warm.
                 given_up.append(Cancelled(player.warm))
                 del self._by_arc[player.warm]
                 player.warm = None
@@ -321,7 +325,7 @@ class FieldRun:
         return Vote(asked.proposal, accept=not reason, reason=reason)
 
     def _heed(self, effect: Effect) -> None:
-        """Carries out a grant or its end."""
+        """Carry out a grant or its end."""
         now = self.world.time
         match effect:
             case Granted(arc=arc):
@@ -348,7 +352,7 @@ class FieldRun:
                 self._judge.ended(player.name, preempted=outcome is Outcome.PREEMPTED)
                 self._halt(player)
                 if not requeued:
-                    # It had its time, or gave back: who wants more asks anew, behind those who wait.
+                    # Its time is over, or it released: it requests again, behind the waiting requests.
                     del self._by_arc[arc]
                     player.asks_at = now
             case _:
@@ -373,7 +377,7 @@ class FieldRun:
                 player.asks_at = now + (GIVEN_UP if player.scout.blindness.dead else RETRY_AFTER)
 
     def _drive(self, player: Player, step: Step) -> None:
-        """At the rate that was asked for; wheels that are to stand are stopped once."""
+        """Send drive commands at the requested rate. Wheels are stopped once."""
         body, now = self.world.bodies[player.name], self.world.time
         if step.left == 0 and step.right == 0:
             if not player.stood:
@@ -396,7 +400,7 @@ class FieldRun:
 
     def _halt(self, player: Player) -> None:
         def halt() -> None:
-            # A newer command to the same robot ends the repeats of an older one.
+            # A newer command to the same robot ends the repeats of older commands.
             current = player.held or player.warmed
             if current is None or player.transmits is not current:
                 body = self.world.bodies[player.name]
@@ -406,7 +410,7 @@ class FieldRun:
         self.send(OVERHEAD, halt, sure=True)
 
     def send(self, size: int, act: Callable[[], None], *, sure: bool = False) -> None:
-        """Does something at the robot when its packet arrives there; `sure`: it is sent until it does."""
+        """Call `act` when the packet arrives at the robot. `sure`: it is repeated until it arrives."""
         begins = max(self.world.time + LATENCY, self._line_free)
         self._line_free = at = begins + size * BITS_PER_BYTE / self.field.baud
         while self._rng.random() < self.field.loss:

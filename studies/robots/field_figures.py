@@ -1,4 +1,4 @@
-"""What came of a sensor net in a building, judged by the building's own truth, which no robot knows."""
+"""Outcomes of a sensor net in a building, judged by the building's ground truth, which no robot knows."""
 
 from __future__ import annotations
 
@@ -20,58 +20,58 @@ from zscout.simulation.building.solids import cuboids_of
 from zscout.simulation.building.world import World
 
 SETTLED: Final = 120.0
-"""Seconds in which all should be placed: walks that begin later count in any case."""
+"""Seconds within which all should be placed: later walks count in any case."""
 WARMED: Final = 2.0
-"""Seconds of watching after which a crossing counts: before, the background is still being learned."""
+"""Crossings count after this many seconds of watching, when the background has been learned."""
 STANDS: Final = 0.01
-"""Metres a second below which a wheel stands; motors run out slowly."""
+"""Metres a second below which a wheel counts as stopped, because motors run out slowly."""
 RUN_OUT: Final = 6.0
-"""Seconds after the end of a hold during which its wheels are watched: no drive packet lasts longer."""
+"""Seconds for which wheels are observed after the end of a hold: no drive packet lasts longer."""
 _REACH: Final = 6.0
-"""Metres at which a robot is still a pixel or two."""
+"""Metres at which a robot still covers a pixel or two."""
 
 
 @dataclass(slots=True)
 class Outcomes:
-    """What came of one run. Times in seconds of the building."""
+    """Outcomes of a run. Times in seconds of virtual time."""
 
     placed: dict[str, float | None] = field(default_factory=dict)
-    """By robot: when it first was hidden by its own word; None for never."""
+    """When each robot first reported to be hidden; None: never."""
     dark: dict[str, bool] = field(default_factory=dict)
-    """By robot: whether it then stood in a truly dark place."""
+    """By robot: True if it then stood in a truly dark place."""
     facing: dict[str, bool] = field(default_factory=dict)
-    """By robot: whether its camera then faced the lit part."""
+    """By robot: True if its camera then faced the lit part."""
     walks: int = 0
     """Walks of people through the building that began when all had been placed, or should have been."""
     noticed: int = 0
-    """Of these: during which some robot reported motion."""
+    """Walks during which a robot reported motion."""
     crossings: int = 0
-    """Of a watching robot's picture, by people."""
+    """Crossings of a watching robot's picture by people."""
     alerted: int = 0
-    """Of these: within IN_TIME."""
+    """Crossings alerted within IN_TIME."""
     resumed: list[float] = field(default_factory=list)
-    """Of each turn of a robot that still stood where it had hidden: seconds from when it was held and its camera warm
-    until it could tell of motion."""
+    """For each turn of a robot that had not moved since it hid: seconds from when it was held and its camera warm until
+    it could report motion."""
     account: dict[str, CrossingsOf] = field(default_factory=dict)
-    """By robot: where all crossings of its place went, whether it was held or not."""
+    """All crossings of each robot's place, whether it was held or not."""
     false_alarms: int = 0
-    """Alerts with nothing in view that moved."""
+    """Alerts without any motion in view."""
     robot_alarms: int = 0
-    """Alerts with nobody in view, but another robot that drove."""
+    """Alerts without a person in view, but with another robot that drove."""
     shadow_alarms: int = 0
-    """Alerts with nobody in view, but the shadow of somebody beside or behind the robot."""
+    """Alerts without a person in view, but with the shadow of a person beside or behind the robot."""
     watched: float = 0.0
     """Seconds of watching, all robots together."""
     watches: dict[str, float] = field(default_factory=dict)
-    """By robot: those after all had been placed."""
+    """Seconds of watching after all had been placed, by robot."""
     holds: int = 0
     preemptions: int = 0
     blind: int = 0
-    """Holds given back because no picture came."""
+    """Holds released because no picture came."""
     turned_unheld: float = 0.0
     """Seconds that wheels turned without a hold, all robots together."""
     longest_stop: float = 0.0
-    """From the end of a hold until the wheels stood, the longest."""
+    """The longest time from the end of a hold until the wheels stopped."""
     seconds: float = 0.0
 
     @property
@@ -81,7 +81,7 @@ class Outcomes:
 
 
 class Judge:
-    """Follows one run and fills in its `Outcomes`."""
+    """Observes a run, and fills in its `Outcomes`."""
 
     def __init__(self, world: World, outcomes: Outcomes) -> None:
         self.outcomes = outcomes
@@ -89,20 +89,19 @@ class Judge:
         self._watchers = {name: Watcher() for name in outcomes.placed}
         self._moved_at = dict.fromkeys(world.bodies, -math.inf)
         self._resuming: dict[str, tuple[float, Pose]] = {}
-        """Robots that were placed before and can't tell of motion yet: since when they are held, and where they stood
-        then."""
+        """Held robots that were placed before and can't report motion yet: the start of the hold, and the pose then."""
         self._unheld_since: dict[str, float] = {}
-        """Robots whose hold ended less than RUN_OUT ago, and when."""
+        """End of the hold, for robots whose hold ended less than RUN_OUT ago."""
         self._turned: set[str] = set()
-        """Of these, those whose wheels turned when last looked at."""
+        """Robots of `_unheld_since` whose wheels turned at the last check."""
         self._walks: dict[int, bool | None] = {}
-        """By number of the walker who is here: whether that was noticed; None if it doesn't count."""
+        """By number of a walker in the building: True if the walk was noticed; None if it doesn't count."""
         self._boxes = cuboids_of(world.plan)
         self._crossings = Crossings(world, list(outcomes.placed))
         outcomes.account = self._crossings.found
 
     def placed(self, robot: str) -> None:
-        """It reports that it is hidden; only the first time counts."""
+        """The robot reports that it is hidden; the outcomes record the first time."""
         if self.outcomes.placed[robot] is None:
             self.outcomes.placed[robot] = self._world.time
             self.outcomes.dark[robot] = self._world.is_dark(robot)
@@ -126,7 +125,7 @@ class Judge:
             self._turned.add(robot)
 
     def looked(self, robot: str, step: Step, interval: float) -> None:
-        """Compares a look of a watching robot, one every `interval` seconds, with what was in its view."""
+        """Compare a look of a watching robot, one every `interval` seconds, with the true scene in its view."""
         watches = step.doing in WATCHING or step.doing == "blind"
         self._crossings.looked(
             robot, watches=watches, picture=step.doing != "blind", learning=step.learning, alert=step.doing == "alert"
@@ -146,7 +145,7 @@ class Judge:
             )
 
     def stepped(self, dt: float, *, alarm: bool) -> None:
-        """The building went on by `dt` seconds. `alarm`: some robot reports motion."""
+        """The building advanced by `dt` seconds. `alarm`: some robot reports motion."""
         now, out = self._world.time, self.outcomes
         for name, body in self._world.bodies.items():
             turns = _turns(body)
@@ -159,7 +158,7 @@ class Judge:
                 out.turned_unheld += dt
                 self._turned.add(name)
             if name in self._turned:
-                # Up to the step in which they came to stand: rather too long than too short.
+                # Up to the step in which they stopped: rounded up.
                 out.longest_stop = max(out.longest_stop, now - since)
             if not turns:
                 self._turned.discard(name)
@@ -176,19 +175,19 @@ class Judge:
                 noticed = self._walks.setdefault(number, False if ready else None)
                 self._walks[number] = noticed if noticed is None else noticed or alarm
             elif (noticed := self._walks.pop(number, None)) is not None:
-                # Counted when it is over, so that the run's end cuts none short.
+                # Counted when it is over, to leave out walks that the run's end cuts short.
                 out.walks += 1
                 out.noticed += noticed
 
     def _robot_in_view(self, robot: str) -> bool:
-        """Whether another robot that drove a moment ago is, or just was, before this one's camera."""
+        """Return True if another robot that drove a moment ago is, or just was, in view of this robot's camera."""
         body, now = self._world.bodies[robot], self._world.time
         for other in self._world.bodies.values():
             away = math.hypot(other.x - body.x, other.y - body.y)
             if other is body or now - self._moved_at[other.name] > CLEAR or away > _REACH:
                 continue
             off = math.atan2(other.y - body.y, other.x - body.x) - body.heading
-            # It may have left the picture meanwhile, and is as wide as it is.
+            # With a margin for its width, and for a robot that has just left the picture.
             if abs(math.remainder(off, math.tau)) > VIEW / 2 + math.atan2(0.3, away):
                 continue
             origin = np.array([[body.x, body.y, EYE]], np.float32)
@@ -199,14 +198,14 @@ class Judge:
 
 
 class Watcher:
-    """One robot that watches under one hold."""
+    """A robot that watches during one hold."""
 
     def __init__(self) -> None:
         self.began: float | None = None
         self.since: float | None = None
-        """When the person in view came into it."""
+        """When the person in view appeared."""
         self.open = False
-        """It is a crossing of which it is not known yet whether it is alerted in time."""
+        """True during a crossing whose outcome is not known yet."""
         self.last_person = self.last_shadow = -math.inf
 
     def look(
@@ -221,7 +220,7 @@ class Watcher:
         if people >= PIXELS and self.since is None:
             self.since, self.open = now, now - self.began >= WARMED
         late = self.since is not None and now - self.since > IN_TIME + 1e-6
-        # A crossing that the hold's end cuts short of both is none.
+        # A crossing cut short by the hold's end before either does not count.
         if self.open and (late or step.doing == "alert"):
             self.open = False
             out.crossings += 1
@@ -238,6 +237,6 @@ class Watcher:
 
 
 def _turns(body: Body) -> bool:
-    """Whether a wheel turns, or is commanded to."""
+    """Return True if a wheel turns, or is commanded to turn."""
     commanded = body.left != 0 or body.right != 0
     return commanded or max(abs(body.speed_left), abs(body.speed_right)) > STANDS

@@ -1,8 +1,8 @@
-"""One Scout, a building and what stands between them, in a closed loop under virtual time.
+"""A Scout, a building and the link between them, in a closed loop under virtual time.
 
-The controller sees what comes out of the receiver, `latency` late and `frame_rate` times a second; its
-commands go out at most `command_rate` times a second, and some are lost. The outcome is judged by the
-building's own truth, which the controller never sees.
+The controller sees the receiver's pictures, `latency` late and `frame_rate` times a second. It sends commands at most
+`command_rate` times a second, and some are lost. The outcome is judged by the building's ground truth, which the
+controller never sees.
 """
 
 from __future__ import annotations
@@ -33,28 +33,28 @@ CHANNEL: Final = 1
 
 @dataclass(frozen=True, slots=True)
 class LinkConditions:
-    """What stands between a controller and its robot."""
+    """The link between a controller and its robot."""
 
     frame_rate: float = 5.0
     """Pictures a second."""
     latency: float = 0.15
-    """Seconds from a picture to the command that answers it, half on each way."""
+    """Seconds from a picture to its command, half in each direction."""
     loss: float = 0.05
     """Share of commands that never arrive."""
     command_rate: float = 5.0
-    """Commands a second at most."""
+    """Most commands a second."""
     missing: float = 0.0
     """Share of pictures that never arrive."""
 
 
 @dataclass(frozen=True, slots=True)
 class HideOutcome:
-    """How one trial went, by the building's own truth."""
+    """The outcome of a trial, by the building's ground truth."""
 
     building: str
     seed: int
     hidden_at: float | None
-    """Seconds from the first picture until the controller reports that it is hidden; None if it never does."""
+    """Seconds from the first picture until the controller reports that it is hidden; None: never."""
     dark: bool
     """The floor at the robot has less than a quarter of the median light."""
     faces_light: bool
@@ -63,7 +63,7 @@ class HideOutcome:
     travelled: float
     """Metres."""
     share: float
-    """Light at the robot's place over the median."""
+    """Light at the robot's place, divided by the median."""
     path: tuple[tuple[float, float, float, float, str], ...] = field(repr=False, default=())
     """Time, x, y, heading, state; at every picture."""
 
@@ -84,8 +84,8 @@ def trial(
     limit: float = LIMIT,
     watch: Watch | None = None,
 ) -> HideOutcome:
-    """One robot (the plan's first) from `start`; the others stand where the plan has them. Ends when the
-    controller reports that it is hidden, or after `limit` seconds from the first good picture."""
+    """Run the plan's first robot from `start`; the others stay at their places in the plan. Ends when the controller
+    reports that it is hidden, or `limit` seconds after the first picture."""
     link = link or LinkConditions()
     robot = plan.robots[0]
     world = World(plan, seed=seed, starts={robot.name: start})
@@ -118,7 +118,7 @@ def trial(
                 watch(now - begun, world, picture, act)
             if act.hidden:
                 hidden_at = now - begun
-            # A robot that stands and is to stand needs no packet.
+            # A robot that stands and remains there needs no packet.
             if (act.moves or not stood) and now >= may_send - 1e-6:
                 may_send = max(may_send, now - 1 / link.command_rate) + 1 / link.command_rate
                 number = (number + 1) % 256
@@ -152,7 +152,7 @@ def trial(
 
 @dataclass(frozen=True, slots=True)
 class HideJob:
-    """One trial of a batch: a random start, lit and clear, drawn by the seed."""
+    """A trial of a batch: a random lit and clear start, drawn by the seed."""
 
     plan: Plan
     seed: int
@@ -160,6 +160,6 @@ class HideJob:
 
 
 def run(job: HideJob) -> HideOutcome:
-    """Carries out one job."""
+    """Run a job."""
     start = World(job.plan, seed=job.seed).random_start(np.random.default_rng(job.seed))
     return trial(job.plan, start, job.seed, link=job.link)

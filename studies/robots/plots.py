@@ -21,38 +21,40 @@ WIDTH: Final = 3.0
 
 Value = Callable[[FieldFigures], float]
 CURVES: Final[tuple[tuple[str, str, Value], ...]] = (
-    ("all_placed", "Seconds until all are placed (median)", lambda one: one.all_placed.median),
-    ("placed", "Robots placed (%)", lambda one: 100 * one.placed),
-    ("noticed", "Walks noticed (%)", lambda one: 100 * one.noticed),
-    ("alerted", "Crossings alerted within 1 s (%)", lambda one: 100 * one.alerted),
+    ("all_placed", "Seconds until all are placed (median)", lambda figure: figure.all_placed.median),
+    ("placed", "Robots placed (%)", lambda figure: 100 * figure.placed),
+    ("noticed", "Walks noticed (%)", lambda figure: 100 * figure.noticed),
+    ("alerted", "Crossings alerted within 1 s (%)", lambda figure: 100 * figure.alerted),
 )
-"""Entity, title, value: each is a pane. What is no number, or never came, is left out."""
+"""Entity, title, value: each is a pane. Values that are NaN or infinite are left out."""
 
 
 def record(path: Path, found: RobotsReport) -> None:
-    """Writes the recording, replacing what was there. Raises BadInput where the file can't be written."""
+    """Write the recording, and replace an existing file. Raises BadInput if the file can't be written."""
     import rerun as rr
 
     with recording(path, APPLICATION, _blueprint(found), _words(found)) as stream:
         _curves(stream, found.grid)
-        radio = [(_radio_name(one), one) for one in found.radio]
-        receivers = [(f"{one.framegrabbers}_framegrabbers", one) for one in found.receivers]
+        radio = [(_radio_name(figure), figure) for figure in found.radio]
+        receivers = [(f"{figure.framegrabbers}_framegrabbers", figure) for figure in found.receivers]
         for kind, bars in (("radio", radio), ("receivers", receivers)):
             for name, _, value in CURVES:
-                for number, (label, one) in enumerate(bars):
-                    if math.isfinite(value(one)):
-                        bar = rr.BarChart([value(one)], abscissa=[number], color=COLOURS[number % len(COLOURS)])
+                for number, (label, figure) in enumerate(bars):
+                    if math.isfinite(value(figure)):
+                        bar = rr.BarChart([value(figure)], abscissa=[number], color=COLOURS[number % len(COLOURS)])
                         stream.log(f"{kind}/{name}/{label}", bar, static=True)
 
 
 def _curves(stream: rr.RecordingStream, grid: Sequence[FieldFigures]) -> None:
     import rerun as rr
 
-    for number, channels in enumerate(sorted({one.channels for one in grid})):
+    for number, channels in enumerate(sorted({figure.channels for figure in grid})):
         colour, legend = COLOURS[number % len(COLOURS)], f"{channels} channel{'s' * (channels != 1)}"
         for name, _, value in CURVES:
             points = [
-                (one.robots, value(one)) for one in grid if one.channels == channels and math.isfinite(value(one))
+                (figure.robots, value(figure))
+                for figure in grid
+                if figure.channels == channels and math.isfinite(value(figure))
             ]
             if not points:
                 continue
@@ -71,7 +73,7 @@ def _blueprint(found: RobotsReport) -> rrb.Blueprint:
     import rerun.blueprint as rrb
 
     boundary = rr.TimeRangeBoundary
-    most = max((one.robots for one in found.grid), default=1)
+    most = max((figure.robots for figure in found.grid), default=1)
     window = rr.TimeRange(start=boundary.absolute(seq=0), end=boundary.absolute(seq=most + 1))
     tabs: list[rrb.Container] = []
     if found.grid:
@@ -92,8 +94,8 @@ def _blueprint(found: RobotsReport) -> rrb.Blueprint:
     return tabs_and_summary(tabs or [rrb.Grid(name="Starts")], ROBOTS)
 
 
-def _radio_name(one: FieldFigures) -> str:
-    return f"{one.baud}_baud_{one.command_rate:g}_per_second".replace(".", "_")
+def _radio_name(figure: FieldFigures) -> str:
+    return f"{figure.baud}_baud_{figure.command_rate:g}_per_second".replace(".", "_")
 
 
 def _words(found: RobotsReport) -> str:
@@ -109,16 +111,17 @@ def _words(found: RobotsReport) -> str:
             lines += ["", f"## {title}", f"| {columns[0]} | {columns[1].replace('_', ' ')} | {head}"]
             lines += ["|---|---|---|---|---|"]
             lines += [
-                f"| {getattr(one, columns[0])} | {getattr(one, columns[1]):g} "
-                f"| {_seconds(one.all_placed.median)} | {_share(one.placed)} "
-                f"| {_share(one.noticed)} of {one.walks} |"
-                for one in figures
+                f"| {getattr(figure, columns[0])} | {getattr(figure, columns[1]):g} "
+                f"| {_seconds(figure.all_placed.median)} | {_share(figure.placed)} "
+                f"| {_share(figure.noticed)} of {figure.walks} |"
+                for figure in figures
             ]
     if found.starts:
         lines += ["", "## One robot, random starts", "| building | hidden in the dark | and facing the light |"]
         lines += ["|---|---|---|"]
         lines += [
-            f"| {one.building} | {one.dark} of {one.starts} | {one.good} of {one.starts} |" for one in found.starts
+            f"| {start.building} | {start.dark} of {start.starts} | {start.good} of {start.starts} |"
+            for start in found.starts
         ]
     return "\n".join(lines)
 

@@ -1,7 +1,7 @@
-"""What more robots, video channels and radio bring: nets in buildings by the dozen, and what came of them.
+"""The benefit of more robots, video channels and radio bandwidth: many runs of nets in buildings, and their figures.
 
-A run of a net is `field`'s, a start of one robot is `hide`'s. Everything here is figures: percentiles over
-runs, sums over what happened rarely.
+`field` runs a net, and `hide` a start of one robot. This module computes figures: percentiles over runs, and sums of
+rare events.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from zscout.simulation.building.plan import Plan
 from zscout.simulation.building.plan_file import load_plan, shipped_plans
 
 DRAWN: Final = "drawn"
-"""As a building: another one for each seed."""
+"""Name of a building that is drawn at random for each seed."""
 ROBOTS: Final = (1, 2, 4, 6, 8)
 CHANNELS: Final = (1, 2, 3, 4)
 BAUDS: Final = (300, 600, 1_200, 2_400, 9_600)
@@ -43,12 +43,12 @@ SECONDS: Final = 180.0
 ENOUGH_BAUD: Final = 9_600
 TURNS: Final = 2
 FEW: Final = 20
-"""Crossings of a robot's place from which its share in time is told."""
+"""Least number of crossings of a robot's place for its share in time."""
 
 
 @dataclass(frozen=True, slots=True)
 class RobotsJob:
-    """One run of a net, or with `field` None one start of one robot."""
+    """A run of a net, or if `field` is None a start of one robot."""
 
     building: str
     seed: int
@@ -58,21 +58,21 @@ class RobotsJob:
 
 @dataclass(frozen=True, slots=True)
 class RobotsTrial:
-    """A job, and what came of it."""
+    """A job and its outcome."""
 
     job: RobotsJob
     outcomes: Outcomes | hide.HideOutcome
 
 
 def buildings() -> list[str]:
-    """Names that `plan_of` knows: those shipped, and DRAWN."""
+    """Names for `plan_of`: the shipped buildings, and DRAWN."""
     return [*shipped_plans(), DRAWN]
 
 
 @lru_cache(maxsize=8)
 def plan_of(building: str, seed: int) -> Plan:
-    """A building by its name, or from its file. Raises BadInput for one that is not there, ValueError where
-    none can be drawn."""
+    """A building by its name, or from its file. Raises BadInput if it does not exist, ValueError if none can be
+    drawn."""
     if building == DRAWN:
         return drawn_plan(seed)
     shipped = shipped_plans()
@@ -86,8 +86,8 @@ def plan_of(building: str, seed: int) -> Plan:
 
 
 def run(job: RobotsJob) -> RobotsTrial:
-    """Carries out one job, in whatever process. Raises BadInput where the building has no room for it."""
-    # One process, one processor: more threads would only get into the others' way.
+    """Run a job, in any process. Raises BadInput if the building has no room for its robots."""
+    # Each process uses one processor: more threads would slow the other processes down.
     cv2.setNumThreads(1)
     try:
         plan = plan_of(job.building, job.seed)
@@ -96,24 +96,24 @@ def run(job: RobotsJob) -> RobotsTrial:
         raise BadInput(f"--building {job.building}, seed {job.seed}: {problem}") from None
     if job.field is None:
         outcome = hide.run(hide.HideJob(plan, job.seed))
-        # Where it drove is of no use to the sums, and large.
+        # The path is large, and not needed here.
         return RobotsTrial(job, replace(outcome, path=()))
     return RobotsTrial(job, FieldRun(crew, job.field, seed=job.seed).run(job.seconds))
 
 
 def grid(robots: Iterable[int], channels: Iterable[int], baud: int = ENOUGH_BAUD) -> list[Field]:
-    """Numbers of robots and channels in every pair; more channels than robots change nothing and are left
-    out, unless that were all."""
+    """All pairs of numbers of robots and channels. More channels than robots change nothing: they are left out, unless
+    no pair would remain."""
     channels = sorted(set(channels))
     fields = []
     for count in sorted(set(robots)):
-        useful = [one for one in channels if one <= count] or channels[:1]
-        fields += [Field(robots=count, channels=one, baud=baud) for one in useful]
+        useful = [number for number in channels if number <= count] or channels[:1]
+        fields += [Field(robots=count, channels=number, baud=baud) for number in useful]
     return fields
 
 
 def radio(bauds: Iterable[int]) -> list[Field]:
-    """Radios of other rates, and behaviors that ask for fewer packets, with everything else plentiful."""
+    """Radios with different rates, and behaviors with lower packet rates; everything else is plentiful."""
     return [
         Field(robots=RADIO_ROBOTS, channels=RADIO_CHANNELS, baud=baud, command_rate=rate)
         for rate in COMMAND_RATES
@@ -124,9 +124,9 @@ def radio(bauds: Iterable[int]) -> list[Field]:
 def receivers(framegrabbers: Iterable[int]) -> list[Field]:
     """Four robots with a channel each, and fewer framegrabbers: the next camera can warm up."""
     return [
-        Field(robots=RADIO_ROBOTS, channels=RADIO_CHANNELS, framegrabbers=one % RADIO_CHANNELS)
-        for one in sorted(set(framegrabbers))
-        if one <= RADIO_CHANNELS
+        Field(robots=RADIO_ROBOTS, channels=RADIO_CHANNELS, framegrabbers=count % RADIO_CHANNELS)
+        for count in sorted(set(framegrabbers))
+        if count <= RADIO_CHANNELS
     ]
 
 
@@ -139,7 +139,7 @@ def turns(slots: Iterable[int]) -> list[Field]:
 
 @dataclass(frozen=True, slots=True)
 class Quantiles:
-    """10, 50 and 90 % of the runs are at or below; infinite where so many never came to it."""
+    """10, 50 and 90 % of the runs are at or below; infinite if fewer runs got there."""
 
     low: float
     median: float
@@ -148,7 +148,7 @@ class Quantiles:
 
 @dataclass(frozen=True, slots=True)
 class FieldFigures:
-    """Of all runs with the same means."""
+    """Figures of all runs with the same field."""
 
     robots: int
     channels: int
@@ -159,67 +159,67 @@ class FieldFigures:
     """Seconds of the slot to hide in."""
     runs: int
     all_placed: Quantiles
-    """Seconds until the last of them was placed."""
+    """Seconds until the last robot was placed."""
     placed: float
     """Share of the robots that were placed within the run."""
     dark: float
-    """Of these: in a truly dark place; NaN where none was placed. So are the shares below."""
+    """Share of placed robots in a truly dark place. This and the shares below are NaN without any."""
     facing: float
-    """Of these: truly facing the light."""
+    """Share of placed robots that truly face the light."""
     walks: int
     noticed: float
     """Share of the walks."""
     noticed_spread: Quantiles
-    """Of the runs' own shares, those with walks."""
+    """Of the shares of single runs with walks."""
     crossings: int
     alerted: float
     """Share of the crossings of a watching robot's picture that were alerted within a second."""
     account: dict[Fate, int]
-    """All crossings of placed robots' places, held or not, by what became of them."""
+    """All crossings of placed robots' places, held or not, by their fate."""
     in_time: float
-    """Share of them."""
+    """Share of these crossings alerted in time."""
     best: float
-    """Share of them that could have been in time, as the robot was on the air, and its camera warm."""
+    """Share of these crossings that could be in time: the robot was on the air, and its camera warm."""
     of_best: float
-    """Share in time of those."""
+    """Share in time among crossings that could be."""
     least: float
-    """Share in time of the robot with the least, as a part of the mean of all robots; over those with FEW or more. A
-    robot is its number, over all runs."""
+    """The lowest share in time of a robot, divided by the mean of all robots; among robots with FEW or more crossings.
+    Robots of different runs with the same number are one robot."""
     least_watch: float
-    """By run, since all were placed: the time for which the robot watched that did so least, as a part of the mean of
-    all. The least of the runs in which each could have had TURNS turns."""
+    """The shortest watching time of a robot after all were placed, divided by the mean of its run; the minimum over the
+    runs in which each robot could have had TURNS turns."""
     resumed: Quantiles
-    """Seconds from a turn's warm camera until the robot could tell of motion, where it still stood as it had hidden."""
+    """Seconds from a turn's warm camera until the robot could report motion, if it had not moved since it hid."""
     watched: float
     """Hours of watching, all robots of all runs."""
     false_alarms: float
-    """By hour of watching."""
+    """Per hour of watching."""
     robot_alarms: float
-    """Alerts at another robot that drove, by hour of watching."""
+    """Alerts caused by another robot that drove, per hour of watching."""
     shadow_alarms: float
-    """Alerts at somebody's shadow, by hour of watching."""
+    """Alerts caused by a person's shadow, per hour of watching."""
     preemptions: float
-    """By run."""
+    """Per run."""
     blind: float
-    """Holds given back for want of a picture, by run."""
+    """Holds released for lack of pictures, per run."""
     turned_unheld: float
-    """Seconds by run that wheels turned without a hold."""
+    """Seconds per run that wheels turned without a hold."""
     longest_stop: float
     """Seconds, the worst of all runs."""
 
 
 @dataclass(frozen=True, slots=True)
 class StartFigures:
-    """Of one robot's random starts in one building."""
+    """Figures of one robot's random starts in one building."""
 
     building: str
     starts: int
     dark: int
-    """Hidden in a truly dark place within the limit."""
+    """Starts that ended hidden in a truly dark place within the limit."""
     good: int
-    """And facing the light."""
+    """Of these, starts that ended facing the light."""
     seconds: Quantiles
-    """Until hidden, of the good ones."""
+    """Until hidden, of the good starts."""
     bumped: float
     """Mean seconds of pushing against something."""
 
@@ -228,7 +228,7 @@ Figures: TypeAlias = FieldFigures | StartFigures
 
 
 def field_figures(trials: Iterable[RobotsTrial]) -> dict[Field, FieldFigures]:
-    """Sums up runs of nets by what they had to work with."""
+    """Figures of runs of nets, by field."""
     by_field: dict[Field, list[Outcomes]] = {}
     for trial in trials:
         if trial.job.field is not None and isinstance(trial.outcomes, Outcomes):
@@ -262,9 +262,9 @@ def _summed(field: Field, runs: Sequence[Outcomes]) -> FieldFigures:
         in_time=whole.in_time,
         best=_share(whole.could, whole.all),
         of_best=_share(whole.told, whole.could),
-        least=min((_share(one.in_time, whole.in_time) for one in of_robots), default=math.nan),
+        least=min((_share(robot.in_time, whole.in_time) for robot in of_robots), default=math.nan),
         least_watch=min((_least_watch(run, field) for run in runs), default=math.nan),
-        resumed=quantiles_of([one for run in runs for one in run.resumed]),
+        resumed=quantiles_of([seconds for run in runs for seconds in run.resumed]),
         watched=hours,
         false_alarms=_share(sum(run.false_alarms for run in runs), hours),
         robot_alarms=_share(sum(run.robot_alarms for run in runs), hours),
@@ -277,18 +277,18 @@ def _summed(field: Field, runs: Sequence[Outcomes]) -> FieldFigures:
 
 
 def _account(runs: Sequence[Outcomes]) -> tuple[CrossingsOf, list[CrossingsOf]]:
-    """Of all runs together, and of each robot over all of them, if it has FEW or more."""
+    """Crossings of all runs together, and of each robot number with FEW or more over all runs."""
     whole, of_robots = CrossingsOf(), dict[int, CrossingsOf]()
     for run in runs:
-        # Buildings have names of their own for their robots.
-        for number, one in enumerate(run.account.values()):
-            whole.add(one)
-            of_robots.setdefault(number, CrossingsOf()).add(one)
-    return whole, [one for one in of_robots.values() if one.all >= FEW]
+        # By number, because buildings name their robots differently.
+        for number, crossings in enumerate(run.account.values()):
+            whole.add(crossings)
+            of_robots.setdefault(number, CrossingsOf()).add(crossings)
+    return whole, [crossings for crossings in of_robots.values() if crossings.all >= FEW]
 
 
 def _least_watch(run: Outcomes, field: Field) -> float:
-    """Infinite where there was no time for TURNS turns of each."""
+    """See `FieldFigures.least_watch`. Infinite if there was no time for TURNS turns of each."""
     turns = TURNS * field.slots.watch * field.robots / field.receivers
     if run.seconds - run.all_placed < turns:
         return math.inf
@@ -297,7 +297,7 @@ def _least_watch(run: Outcomes, field: Field) -> float:
 
 
 def start_figures(trials: Iterable[RobotsTrial]) -> list[StartFigures]:
-    """Sums up the starts of one robot by building, in the order in which they first come."""
+    """Figures of the starts of one robot by building, in the order of their first starts."""
     by_building: dict[str, list[hide.HideOutcome]] = {}
     for trial in trials:
         if isinstance(trial.outcomes, hide.HideOutcome):
@@ -306,10 +306,10 @@ def start_figures(trials: Iterable[RobotsTrial]) -> list[StartFigures]:
         StartFigures(
             building=building,
             starts=len(those),
-            dark=sum(one.hidden_at is not None and one.dark for one in those),
-            good=sum(one.good for one in those),
-            seconds=quantiles_of([one.hidden_at for one in those if one.good and one.hidden_at is not None]),
-            bumped=float(np.mean([one.bumped for one in those])),
+            dark=sum(start.hidden_at is not None and start.dark for start in those),
+            good=sum(start.good for start in those),
+            seconds=quantiles_of([start.hidden_at for start in those if start.good and start.hidden_at is not None]),
+            bumped=float(np.mean([start.bumped for start in those])),
         )
         for building, those in by_building.items()
     ]
@@ -317,8 +317,7 @@ def start_figures(trials: Iterable[RobotsTrial]) -> list[StartFigures]:
 
 @dataclass(frozen=True, slots=True)
 class RobotsReport:
-    """What a study found: by robots and channels, by framegrabbers, by radio, by the length of turns, and of single
-    robots."""
+    """Figures by robots and channels, by framegrabbers, by radio, by the length of turns, and of single robots."""
 
     grid: list[FieldFigures]
     receivers: list[FieldFigures]
@@ -344,7 +343,7 @@ class StudyPlan:
         bauds: Sequence[int],
         slots: Sequence[int],
     ) -> StudyPlan:
-        """Only what is given is tried; without anything, all."""
+        """Fields for the given numbers only; without any numbers, all defaults."""
         everything = not (robots or channels or framegrabbers or bauds or slots)
         return StudyPlan(
             grid(robots or ROBOTS, channels or CHANNELS) if robots or channels or everything else (),
@@ -354,27 +353,27 @@ class StudyPlan:
         )
 
     def jobs(self, names: Sequence[str], seeds: Iterable[int], seconds: float) -> list[RobotsJob]:
-        """Every field in every building with every seed; a field that comes twice is run once."""
+        """Every field in every building with every seed; duplicate fields run once."""
         fields = list(dict.fromkeys([*self.grid, *self.receivers, *self.radio, *self.turns]))
-        # Seed by seed, so that what is there when somebody stops early is a whole study of fewer seeds.
+        # Seed by seed, so that a study that is stopped early is complete for its first seeds.
         places = [(name, seed) for seed in seeds for name in names]
         if not fields:
             return [RobotsJob(name, seed, None) for name, seed in places]
-        return [RobotsJob(name, seed, one, seconds) for name, seed in places for one in fields]
+        return [RobotsJob(name, seed, field, seconds) for name, seed in places for field in fields]
 
     def report(self, trials: Sequence[RobotsTrial]) -> RobotsReport:
         by_field = field_figures(trials)
         return RobotsReport(
-            grid=[by_field[one] for one in self.grid],
-            receivers=[by_field[one] for one in self.receivers],
-            radio=[by_field[one] for one in self.radio],
-            turns=[by_field[one] for one in self.turns],
+            grid=[by_field[field] for field in self.grid],
+            receivers=[by_field[field] for field in self.receivers],
+            radio=[by_field[field] for field in self.radio],
+            turns=[by_field[field] for field in self.turns],
             starts=start_figures(trials),
         )
 
 
 def quantiles_of(values: Sequence[float]) -> Quantiles:
-    """By nearest rank: no value is made up between two, and infinite ones do no harm. NaN of nothing."""
+    """Quantiles by nearest rank: without interpolation, so values may be infinite. NaN without values."""
     if not values:
         return Quantiles(math.nan, math.nan, math.nan)
     ranked = sorted(values)

@@ -1,4 +1,4 @@
-"""The study of robots as pictures for a page: SVG, drawn by hand, so that no plotting library is needed."""
+"""The study of robots as SVG pictures for a page, drawn without a plotting library."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from studies.robots.study import FieldFigures, Quantiles
 from zscout.config.strict import BadInput
 
 COLOURS: Final = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#000000", "#999999")
-"""Okabe and Ito's, told apart by everybody."""
+"""The palette of Okabe and Ito, which people with colour blindness can distinguish."""
 WIDTH: Final = 560
 HEIGHT: Final = 300
 LEFT: Final = 58
@@ -21,44 +21,46 @@ RIGHT: Final = 120
 TOP: Final = 34
 BOTTOM: Final = 46
 NEVER: Final = 0.12
-"""Share of the plot's height that is kept at its top for what never came."""
+"""Part of the plot's height that is reserved at its top for infinite values."""
 
 Lines: TypeAlias = Mapping[str, Sequence[tuple[str, Quantiles]]]
-"""By name in the legend: places on the x axis by their names, and what is drawn there."""
+"""Points by the line's name in the legend: the name of a place on the x axis, and the quantiles to draw there."""
 
 
 @dataclass(frozen=True, slots=True)
 class Plot:
-    """One picture: lines of medians, with bars from 10 to 90 %."""
+    """A picture: lines of medians, with bars from 10 to 90 %."""
 
     title: str
     across: str
     up: str
     lines: Lines
     top: float | None = None
-    """The y axis ends there; None: above all there is."""
+    """The end of the y axis; None: above all values."""
 
 
 def plots(grid: Sequence[FieldFigures], radio: Sequence[FieldFigures]) -> dict[str, Plot]:
-    """By file name: what a study's figures show. What was not measured has no plot."""
+    """The plots of a study's figures, by file name. Figures that were not measured have no plot."""
     drawn: dict[str, Plot] = {}
     if grid:
-        across, named = "robots", lambda one: str(one.robots)
-        by = _lines(grid, lambda one: _plural(one.channels, "channel"), named)
-        drawn["robots-placed.svg"] = Plot("Until all are placed", across, "seconds", by(lambda o: o.all_placed))
+        across, named = "robots", lambda figure: str(figure.robots)
+        by = _lines(grid, lambda figure: _plural(figure.channels, "channel"), named)
+        drawn["robots-placed.svg"] = Plot(
+            "Until all are placed", across, "seconds", by(lambda figure: figure.all_placed)
+        )
         drawn["robots-noticed.svg"] = Plot(
-            "Walks that were noticed", across, "%", by(lambda one: _percent(one.noticed_spread)), 100
+            "Walks that were noticed", across, "%", by(lambda figure: _percent(figure.noticed_spread)), 100
         )
     if radio:
-        by = _lines(radio, lambda one: f"{one.command_rate:g} commands/s", lambda one: str(one.baud))
+        by = _lines(radio, lambda figure: f"{figure.command_rate:g} commands/s", lambda figure: str(figure.baud))
         means = f"{_plural(radio[0].robots, 'robot')}, {_plural(radio[0].channels, 'channel')}"
         title = f"Until all are placed: {means}"
-        drawn["robots-radio.svg"] = Plot(title, "baud", "seconds", by(lambda one: one.all_placed))
+        drawn["robots-radio.svg"] = Plot(title, "baud", "seconds", by(lambda figure: figure.all_placed))
     return drawn
 
 
 def write(folder: Path, grid: Sequence[FieldFigures], radio: Sequence[FieldFigures]) -> None:
-    """Writes the plots into a folder that is there, replacing those of the same names. Raises BadInput."""
+    """Write the plots into an existing folder, and replace files of the same names. Raises BadInput."""
     for name, plot in plots(grid, radio).items():
         try:
             (folder / name).write_text(svg(plot), encoding="utf-8")
@@ -105,7 +107,7 @@ def svg(plot: Plot) -> str:
         out.append(_text(LEFT - 6, TOP + 8, "never", "end"))
     out += [_text(x(tick), HEIGHT - BOTTOM + 16, tick, "middle") for tick in ticks]
     for number, (name, line) in enumerate(plot.lines.items()):
-        # Beside each other, so that bars at one place don't cover each other.
+        # Side by side, so that bars at the same place don't cover each other.
         shift = (number - (len(plot.lines) - 1) / 2) * 7
         out += _line(number, name, [(x(tick, shift), spread) for tick, spread in line], y)
     return "\n".join([*out, "</svg>", ""])
@@ -135,19 +137,19 @@ def _line(number: int, name: str, points: Sequence[tuple[float, Quantiles]], y: 
 def _lines(
     figures: Sequence[FieldFigures], legend: Callable[[FieldFigures], str], tick: Callable[[FieldFigures], str]
 ) -> Callable[[Callable[[FieldFigures], Quantiles]], Lines]:
-    """Sorts figures into lines, of whatever is to be drawn."""
+    """Return a function that sorts a value of the figures into lines."""
 
     def of(value: Callable[[FieldFigures], Quantiles]) -> Lines:
         lines: dict[str, list[tuple[str, Quantiles]]] = {}
-        for one in figures:
-            lines.setdefault(legend(one), []).append((tick(one), value(one)))
+        for figure in figures:
+            lines.setdefault(legend(figure), []).append((tick(figure), value(figure)))
         return lines
 
     return of
 
 
 def _scale(highest: float) -> tuple[float, float]:
-    """A round step, and the end of an axis of four to eight of them that reaches `highest`."""
+    """A round step, and the end of an axis of four to eight steps that reaches `highest`."""
     rough = max(highest, 1e-9) / 5
     power = 10.0 ** math.floor(math.log10(rough))
     step = next(power * factor for factor in (1, 2, 2.5, 5, 10) if power * factor >= rough * 0.999)

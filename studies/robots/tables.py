@@ -1,4 +1,4 @@
-"""What `python -m studies robots` prints for people."""
+"""Tables of `python -m studies robots`."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def print_report(found: RobotsReport, names: Sequence[str], seeds: int, seconds:
             terminal.print_line("")
         terminal.print_table(
             [*(key.replace("command_rate", "commands/s") for key in keys), *COLUMNS],
-            [[*(f"{getattr(one, key):g}" for key in keys), *_cells(one)] for one in figures],
+            [[*(f"{getattr(row, key):g}" for key in keys), *_cells(row)] for row in figures],
             title=title,
         )
         _print_account(keys, figures)
@@ -47,32 +47,32 @@ def print_report(found: RobotsReport, names: Sequence[str], seeds: int, seconds:
             ["building", "starts", "truly dark", "and facing the light", "seconds (10-90 %)", "bumps"],
             [
                 [
-                    one.building,
-                    str(one.starts),
-                    f"{one.dark} ({one.dark / one.starts:.0%})",
-                    f"{one.good} ({one.good / one.starts:.0%})",
-                    spread_text(one.seconds),
-                    f"{one.bumped:.1f} s",
+                    start.building,
+                    str(start.starts),
+                    f"{start.dark} ({start.dark / start.starts:.0%})",
+                    f"{start.good} ({start.good / start.starts:.0%})",
+                    spread_text(start.seconds),
+                    f"{start.bumped:.1f} s",
                 ]
-                for one in found.starts
+                for start in found.starts
             ],
             title="One robot, random starts: hidden within 120 s",
         )
 
 
 def _print_account(keys: Sequence[str], figures: Sequence[FieldFigures]) -> None:
-    """Where the crossings of placed robots went, and what share of them could have been in time."""
-    told = [one for one in figures if sum(one.account.values())]
-    if not told:
+    """The fates of crossings of placed robots, and the share that could have been in time."""
+    counted = [figure for figure in figures if sum(figure.account.values())]
+    if not counted:
         return
-    fates = [fate for fate in FATES if any(one.account[fate] for one in told)]
+    fates = [fate for fate in FATES if any(figure.account[fate] for figure in counted)]
     rows = []
-    for one in told:
-        whole = sum(one.account.values())
-        shares = (percent(one.account[fate] / whole) for fate in fates)
-        least = percent(one.least), "-" if math.isinf(one.least_watch) else percent(one.least_watch)
-        cells = [percent(one.best), percent(one.of_best), *least, spread_text(one.resumed, 1)]
-        rows.append([*(f"{getattr(one, key):g}" for key in keys), str(whole), *shares, *cells])
+    for figure in counted:
+        whole = sum(figure.account.values())
+        shares = (percent(figure.account[fate] / whole) for fate in fates)
+        least = percent(figure.least), "-" if math.isinf(figure.least_watch) else percent(figure.least_watch)
+        cells = [percent(figure.best), percent(figure.of_best), *least, spread_text(figure.resumed, 1)]
+        rows.append([*(f"{getattr(figure, key):g}" for key in keys), str(whole), *shares, *cells])
     terminal.print_line("")
     heads = [
         *(key.replace("command_rate", "commands/s") for key in keys),
@@ -84,35 +84,37 @@ def _print_account(keys: Sequence[str], figures: Sequence[FieldFigures]) -> None
         "least watch",
         "resumes in",
     ]
-    terminal.print_table(heads, rows, title="Where the crossings of placed robots went")
+    terminal.print_table(heads, rows, title="Fates of the crossings of placed robots")
 
 
 def _means(figures: Sequence[FieldFigures]) -> str:
-    """`4 robots, 1 channel`; nothing for none."""
-    return "".join(f"{one.robots} robots, {one.channels} channel{'s' * (one.channels != 1)}" for one in figures)
+    """For example `4 robots, 1 channel`; empty without figures."""
+    return "".join(
+        f"{figure.robots} robots, {figure.channels} channel{'s' * (figure.channels != 1)}" for figure in figures
+    )
 
 
-def _cells(one: FieldFigures) -> list[str]:
+def _cells(row: FieldFigures) -> list[str]:
     return [
-        spread_text(one.all_placed),
-        percent(one.placed),
-        percent(one.dark),
-        f"{percent(one.noticed)} of {one.walks}",
-        f"{percent(one.alerted)} of {one.crossings}",
-        "-" if math.isnan(one.false_alarms) else f"{one.false_alarms:.1f}",
-        f"{one.preemptions:.1f}",
-        f"{one.turned_unheld:.1f} s",
-        f"{one.longest_stop:.1f} s",
+        spread_text(row.all_placed),
+        percent(row.placed),
+        percent(row.dark),
+        f"{percent(row.noticed)} of {row.walks}",
+        f"{percent(row.alerted)} of {row.crossings}",
+        "-" if math.isnan(row.false_alarms) else f"{row.false_alarms:.1f}",
+        f"{row.preemptions:.1f}",
+        f"{row.turned_unheld:.1f} s",
+        f"{row.longest_stop:.1f} s",
     ]
 
 
 def percent(share: float) -> str:
-    """`95 %`, or a dash where there was nothing to have a share of."""
+    """For example `95 %`; a dash for NaN."""
     return "-" if math.isnan(share) else f"{share:.0%}"
 
 
 def spread_text(spread: Quantiles, digits: int = 0) -> str:
-    """`41 s (30-77)`; what never came to an end is `never`."""
+    """For example `41 s (30-77)`; infinite values are `never`."""
     if math.isnan(spread.median):
         return "-"
     low, median, high = (

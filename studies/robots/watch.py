@@ -1,6 +1,6 @@
-"""A hidden robot that watches, under virtual time: what it alerts to, and when it does so for nothing.
+"""A hidden robot that watches, under virtual time: its alerts to people, and its false alarms.
 
-`watch` is one such watch, `cases` are many of them, in several buildings at several levels of noise.
+`watch` is a single watch; `cases` are many, in several buildings at several levels of noise.
 """
 
 from __future__ import annotations
@@ -22,39 +22,39 @@ from zscout.simulation.building.plan_file import load_plan, shipped_plans
 from zscout.simulation.building.world import World
 
 PIXELS: Final = 60
-"""Of a person in the picture, from which a crossing counts."""
+"""A crossing counts from this number of pixels of a person."""
 IN_TIME: Final = 1.0
-"""Seconds within which it is to be alerted."""
+"""Time limit for the alert, in seconds."""
 CLEAR: Final = 2.0
-"""Seconds after the last pixel of a person during which a word about motion is no false alarm."""
+"""Seconds after the last pixel of a person during which an alert is not a false alarm."""
 STEP: Final = 0.1
 DRAWN: Final = "drawn"
-"""The building of a case that is drawn at random, from the case's seed."""
+"""Name of a building that is drawn at random from the case's seed."""
 NOISES: Final = (0.5, 1.0, 2.0)
-"""Times the usual noise of camera and air."""
+"""Factors of the usual noise of camera and air."""
 FIRST_WALK: Final = 6.0
 NEXT_WALK: Final = 20.0
-"""Seconds until somebody comes, and from his leaving to his coming again; with the plan's own jitter."""
+"""Seconds until a person comes, and from leaving to coming again; with the plan's jitter."""
 
 
 @dataclass(slots=True)
 class Watched:
-    """What came of it."""
+    """The outcome of a watch."""
 
     crossings: int = 0
     alerted: int = 0
-    """Of these, within IN_TIME."""
+    """Crossings alerted within IN_TIME."""
     late: list[float] = field(default_factory=list)
-    """Seconds by which the others were later; what was never alerted is not here."""
+    """Seconds until the alerts of other crossings, without those never alerted."""
     false_alarms: int = 0
-    """Spells of alarm that began with nobody in view, or lasted until CLEAR after the last one was."""
+    """Spells of alarm with no person in view for CLEAR."""
     empty: float = 0.0
-    """Seconds in which nobody was in view."""
+    """Seconds without a person in view."""
     garbled: int = 0
     pictures: int = 0
 
     def add(self, other: Watched) -> None:
-        """Makes it the sum of both."""
+        """Add the counts of `other`."""
         self.crossings += other.crossings
         self.alerted += other.alerted
         self.late += other.late
@@ -65,8 +65,8 @@ class Watched:
 
 
 def watch(plan: Plan, *, seed: int, noise: float, seconds: float, rate: float = 5.0) -> Watched:
-    """Watches from a dark place of `plan` that faces the light, at `rate` pictures a second, with `noise`
-    times the usual noise of camera and air."""
+    """Watch from a dark place of `plan` that faces the light, with `rate` pictures a second and `noise` times the usual
+    noise of camera and air."""
     spoiled = msgspec.structs.replace(plan.noise, sensor=noise, analog=noise)
     world = World(msgspec.structs.replace(plan, noise=spoiled), seed=seed)
     air, detector, out = Air(seed=seed), MotionDetector(), Watched()
@@ -105,8 +105,8 @@ def watch(plan: Plan, *, seed: int, noise: float, seconds: float, rate: float = 
 
 
 def hide_at_random(world: World, rng: np.random.Generator) -> str:
-    """Puts the first robot into a dark place from which it faces the light; its name. Raises ValueError where
-    there is none."""
+    """Put the first robot into a dark place, facing the light, and return its name. Raises ValueError if there is no
+    such place."""
     name = next(iter(world.bodies))
     truth = world.truth
     dark = np.argwhere(truth.dark)
@@ -121,7 +121,7 @@ def hide_at_random(world: World, rng: np.random.Generator) -> str:
 
 
 class Case(NamedTuple):
-    """One watch of many."""
+    """A single watch of `cases`."""
 
     building: str
     """The name of a shipped plan, or DRAWN."""
@@ -134,21 +134,21 @@ class Case(NamedTuple):
 def cases(
     buildings: Iterable[str], *, seeds: int, noises: Sequence[float] = NOISES, seconds: float = 90.0
 ) -> list[Case]:
-    """All of them, seed by seed, so that a study that is cut short is still even."""
+    """All cases, seed by seed, so that a study that is stopped early is complete for its first seeds."""
     names = list(buildings)
     return [Case(name, noise, seed, seconds) for seed in range(seeds) for name in names for noise in noises]
 
 
 def watch_case(case: Case) -> Watched:
-    """Carries out one case, in whatever process. People walk often: see FIRST_WALK."""
-    # One process, one processor: more threads would only get into the others' way.
+    """Run a case, in any process. People walk often: see FIRST_WALK."""
+    # Each process uses one processor: more threads would slow the other processes down.
     cv2.setNumThreads(1)
     return watch(plan_of(case), seed=case.seed, noise=case.noise, seconds=case.seconds)
 
 
 def plan_of(case: Case) -> Plan:
-    """Its building, with people who walk often. Raises KeyError for an unknown one."""
+    """The case's building, with people who walk often. Raises KeyError if it is unknown."""
     drawn = case.building == DRAWN
     plan = drawn_plan(case.seed) if drawn else load_plan(shipped_plans()[case.building])
-    people = tuple(msgspec.structs.replace(one, first=FIRST_WALK, every=NEXT_WALK) for one in plan.people)
+    people = tuple(msgspec.structs.replace(person, first=FIRST_WALK, every=NEXT_WALK) for person in plan.people)
     return msgspec.structs.replace(plan, people=people)

@@ -1,6 +1,6 @@
-"""The empirical analysis that the paper asks for: strategies side by side on families of random workloads.
+"""The empirical analysis that the paper asks for: strategies compared on families of random workloads.
 
-`families` makes workloads from seeds, `trial` runs one through the core, `measures` and `situations` say what
-came of it, `summary` and `foretell` put many trials together. Nothing here reads a clock, a file or the
-number of processors: the caller gives the clock and spreads the trials.
+`families` makes workloads from seeds, `trial` runs a workload through the core, `measures` and `situations` evaluate
+the run, `summary` and `foretell` combine many trials. Nothing here reads a clock, a file or the number of processors:
+the caller passes the clock and distributes the trials.
 """

@@ -1,6 +1,6 @@
-"""What batch schedulers do, for comparison: EASY and conservative backfill, and shortest first, on distinct devices.
+"""Batch schedulers for comparison: EASY and conservative backfill, and shortest first, on distinct devices.
 
-Runtimes are exact and nobody is preempted. Each returns the start of every job, in ns; jobs are in order of arrival."""
+Runtimes are exact, without preemption. Each returns the start of every job in ns, with jobs in order of arrival."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ ALL: Final = (1 << DEVICES) - 1
 Running: TypeAlias = list[tuple[Ns, int]]
 """A heap of ends and bits of devices."""
 Pick: TypeAlias = Callable[[Ns, list[int], int, Running], Iterator[tuple[int, int]]]
-"""The jobs that start at an instant, by number, of those that wait in order of arrival, each with its devices. They
-have left the queue when the next one is picked."""
+"""Picks the jobs that start at an instant, from a queue in order of arrival. Yields their numbers and devices. A job
+has left the queue when the next is picked."""
 
 
 def easy(jobs: Sequence[Job]) -> list[Ns]:
-    """First come first; others pass where they do not delay the first (Lifka, 1995)."""
+    """First come, first served; others may pass if they do not delay the first in the queue (Lifka, 1995)."""
 
     def pick(now: Ns, queue: list[int], free: int, running: Running) -> Iterator[tuple[int, int]]:
         while queue and (mask := _fit(jobs[queue[0]], free)):
@@ -45,7 +45,7 @@ def easy(jobs: Sequence[Job]) -> list[Ns]:
 
 
 def shortest_first(jobs: Sequence[Job]) -> list[Ns]:
-    """Whatever fits starts, the shortest first."""
+    """Every job that fits starts, the shortest first."""
 
     def pick(_now: Ns, queue: list[int], free: int, _running: Running) -> Iterator[tuple[int, int]]:
         for number in sorted(queue, key=lambda number: jobs[number].runtime):
@@ -57,7 +57,7 @@ def shortest_first(jobs: Sequence[Job]) -> list[Ns]:
 
 
 def conservative(jobs: Sequence[Job]) -> list[Ns]:
-    """Everybody has a reservation from the arrival on. As runtimes are exact, it is the start."""
+    """Every job gets a reservation on arrival. As runtimes are exact, this is its start."""
     booked: list[list[tuple[Ns, Ns]]] = [[] for _ in range(DEVICES)]
     return [_book(job, booked) for job in jobs]
 
@@ -71,7 +71,7 @@ def _book(job: Job, booked: list[list[tuple[Ns, Ns]]]) -> Ns:
     for start in times:
         free = [number for number in named if _is_free(booked[number], start, start + job.runtime)]
         if len(free) >= job.width:
-            # Of equal devices, those that are taken again first.
+            # Among equal devices, prefer those whose next reservation is earliest.
             free.sort(key=lambda number: next((begin for begin, _ in booked[number] if begin >= start), 1 << 62))
             for number in free[: job.width]:
                 insort(booked[number], (start, start + job.runtime))
@@ -110,7 +110,7 @@ def _play(jobs: Sequence[Job], pick: Pick) -> list[Ns]:
 
 
 def _fit(job: Job, free: int) -> int:
-    """The devices with which it could start; 0: none."""
+    """The devices with which the job could start; 0: none."""
     if job.mask:
         return job.mask if not job.mask & ~free else 0
     return _lowest(free, job.width) if free.bit_count() >= job.width else 0
@@ -126,7 +126,7 @@ def _lowest(mask: int, count: int) -> int:
 
 
 def _shadow(job: Job, free: int, running: Running) -> tuple[Ns, int]:
-    """When a job can start, and with which devices: of those that are free by then, the last to come free."""
+    """The earliest start of a job, and its devices: among those free by then, the last to become free."""
     last: list[int] = []
     for end, mask in sorted(running):
         last.append(mask)

@@ -1,8 +1,8 @@
-"""What bookings cost and what they give: one stream of requests, a share of them booked ahead or not.
+"""The cost and benefit of bookings: the same stream of requests, with different shares of them booked ahead.
 
-Who books does so some time before it wants to start, takes the first slot from then on, and asks at its date. Without
-bookings the same requests ask when they want to start. Who is booked at a larger share is so at none smaller than its
-own: runs of one seed differ in nothing else.
+A request is booked some time before its wanted start, takes the first slot after that start, and asks at its date.
+Other requests ask at their wanted start. Each request has a share from which on it is booked, so runs of the same seed
+differ in nothing else.
 """
 
 from __future__ import annotations
@@ -34,11 +34,11 @@ BOOKABLE: Final = ("calm", "load65", "narrow", "levels", "operators", "overload"
 """Streams of exclusive RCs."""
 DEFAULT_FAMILIES: Final = ("load65", "levels")
 SHARES: Final = (0.0, 0.1, 0.2, 0.4)
-"""Of the requests, booked ahead."""
+"""Shares of requests that are booked ahead."""
 AHEAD: Final[tuple[Ns, Ns]] = (30 * SECOND, 120 * SECOND)
-"""How long before it wants to start it is booked, drawn evenly: 6 to 24 times the mean runtime."""
+"""Time from the booking to the wanted start, drawn uniformly: 6 to 24 times the mean runtime."""
 LATEST: Final[Ns] = 600 * SECOND
-"""How much later a slot may be than it was wanted; else it asks as without a booking."""
+"""Longest delay of a slot after the wanted start. Without such a slot the request is not booked."""
 PATIENCE: Final[Ns] = 10 * SECOND
 
 
@@ -56,40 +56,40 @@ class BookingTrial:
     job: BookingJob
     in_use: float
     lost: float
-    """Share of all RC-time in which an RC was idle though somebody waited for it whom a booking kept out."""
+    """Share of all RC-time in which an RC was idle although a request that a booking held back needed it."""
     thrown_away: float
     wait: Mapping[ArcId, Ns]
-    """From when each ARC asked, or the date for which it was booked, to the start of the hold that it completed."""
+    """From each ARC's request, or its booked date, to the start of its completed hold."""
     moved: Mapping[ArcId, Ns]
-    """By ARC that was booked: how much later than it was wanted."""
+    """Delay of the date after the wanted start, by booked ARC."""
 
 
 def drawn(job: BookingJob, workload: Workload) -> dict[ArcId, Ns]:
-    """Who books, and how long ahead."""
+    """The ARCs that are booked, and how long ahead."""
     random = Random(f"bookings/{job.family}/{job.seed}")  # noqa: S311 - workloads, not secrets
-    draws = [(one.request.arc, random.random(), random.randint(*AHEAD)) for one in workload.arrivals]
+    draws = [(arrival.request.arc, random.random(), random.randint(*AHEAD)) for arrival in workload.arrivals]
     return {arc: ahead for arc, place, ahead in draws if place < job.share}
 
 
 def run(job: BookingJob) -> BookingTrial:
-    """Runs a job to its end. Raises KeyError for a family that does not exist."""
+    """Run a job to its end. Raises KeyError for an unknown family."""
     workload = FAMILIES[job.family].workload(job.seed)
     return play(job, workload, drawn(job, workload))
 
 
 def play(job: BookingJob, workload: Workload, ahead: Mapping[ArcId, Ns]) -> BookingTrial:
-    """The same with a workload of exclusive RCs and bookings of the caller's own."""
+    """The same with the caller's workload of exclusive RCs, and its bookings: `ahead` in ns by ARC."""
     played = _Run(workload)
-    for one in workload.arrivals:
-        if one.request.arc in ahead:
-            played.at(max(0, one.at - ahead[one.request.arc]), partial(played.book, one))
+    for arrival in workload.arrivals:
+        if arrival.request.arc in ahead:
+            played.at(max(0, arrival.at - ahead[arrival.request.arc]), partial(played.book, arrival))
         else:
-            played.at(one.at, partial(played.ask, one.request))
-    played.go_on()
-    wanted = {one.request.arc: one.at for one in workload.arrivals}
+            played.at(arrival.at, partial(played.ask, arrival.request))
+    played.play_all()
+    wanted = {arrival.request.arc: arrival.at for arrival in workload.arrivals}
     # A booking asks at its date.
     asked = {arc: at + played.moved.get(arc, 0) for arc, at in wanted.items()}
-    done = {one.arc: one.start for one in played.holds if one.outcome is model.Outcome.COMPLETED}
+    done = {hold.arc: hold.start for hold in played.holds if hold.outcome is model.Outcome.COMPLETED}
     found = measure(workload, Replay(tuple(played.holds), tuple(wanted.keys() - done.keys())))
     last = max(wanted.values(), default=0)
     return BookingTrial(
@@ -103,11 +103,11 @@ def play(job: BookingJob, workload: Workload, ahead: Mapping[ArcId, Ns]) -> Book
 
 
 class _Run:
-    """The core under virtual time, with what is still to come."""
+    """The core under virtual time, with an agenda of coming events."""
 
     def __init__(self, workload: Workload) -> None:
         self._core, self._rcs = Core(Adaptive()), [rc.name for rc in workload.rcs]
-        self._last = max((one.at for one in workload.arrivals), default=0)
+        self._last = max((arrival.at for arrival in workload.arrivals), default=0)
         self._agenda: list[tuple[Ns, int, Callable[[], Iterator[model.Event]]]] = []
         self._numbers = itertools.count()
         self._now: Ns = 0
@@ -121,8 +121,8 @@ class _Run:
     def at(self, time: Ns, make: Callable[[], Iterator[model.Event]]) -> None:
         heapq.heappush(self._agenda, (time, next(self._numbers), make))
 
-    def go_on(self) -> None:
-        """Until nothing is left."""
+    def play_all(self) -> None:
+        """Play until the agenda is empty and all holds have ended."""
         while self._agenda or self._ends:
             coming = min((*self._ends.values(), *(time for time, _, _ in self._agenda[:1])))
             wasted = len(self._lost()) if self._now < self._last else 0
@@ -136,24 +136,26 @@ class _Run:
     def ask(self, request: model.ArcRequest) -> Iterator[model.Event]:
         yield model.Requested(request)
 
-    def book(self, one: Arrival) -> Iterator[model.Event]:
-        request, now = one.request, self._now
+    def book(self, arrival: Arrival) -> Iterator[model.Event]:
+        request, now = arrival.request, self._now
         wanted = Booking(
-            f"b-{request.arc}", request.needs, request.priority, one.at, request.min_runtime, PATIENCE, now
+            f"b-{request.arc}", request.needs, request.priority, arrival.at, request.min_runtime, PATIENCE, now
         )
-        found = self._core.slots(wanted, one.at + LATEST, 1).found
+        found = self._core.slots(wanted, arrival.at + LATEST, 1).found
         if not found:
-            self.at(one.at, partial(self.ask, request))
+            self.at(arrival.at, partial(self.ask, request))
             return
         start = found[0].start
-        self.moved[request.arc] = start - one.at
+        self.moved[request.arc] = start - arrival.at
         self.at(start, partial(self.ask, replace(request, booking=wanted.id)))
-        # One after the other: the next that books in this instant has to see it.
+        # Add it at once, because the next booking of this instant must see it.
         self._step([Booked(replace(wanted, start=start))])
         yield model.Tick()
 
     def _step(self, events: Sequence[model.Event]) -> None:
-        for effect in (one for effects in play_instant(self._core, self._now, events, _no_votes) for one in effects):
+        for effect in (
+            effect for effects in play_instant(self._core, self._now, events, _no_votes) for effect in effects
+        ):
             match effect:
                 case model.Granted(arc=arc, end=end) if end is not None:
                     self._starts[arc], self._ends[arc] = self._now, end
@@ -164,11 +166,11 @@ class _Run:
                     assert state is not BookingState.LAPSED, booking
 
     def _lost(self) -> set[RcName]:
-        """RCs that are idle, and would not be without the bookings."""
+        """RCs that are idle because of bookings."""
         status = self._core.status()
         idle = {rc.name for rc in status.rcs if not rc.holders}
-        kept_out = (one for one in status.queued if one.reason is not None and one.reason.code is ReasonCode.BOOKED)
-        return idle & {rc for one in kept_out for rc in one.needs}
+        kept_out = (arc for arc in status.queued if arc.reason is not None and arc.reason.code is ReasonCode.BOOKED)
+        return idle & {rc for arc in kept_out for rc in arc.needs}
 
 
 def _no_votes(asked: model.Propose) -> model.Vote:
@@ -177,7 +179,7 @@ def _no_votes(asked: model.Propose) -> model.Vote:
 
 @dataclass(frozen=True, slots=True)
 class BookingsRow:
-    """One family at one share, on average over the seeds."""
+    """A family at a share of bookings, averaged over the seeds."""
 
     share: float
     booked: float
@@ -186,13 +188,13 @@ class BookingsRow:
     lost: float
     thrown_away: float
     at_date: float
-    """Share of the booked that began at their dates."""
+    """Share of the booked ARCs that began at their dates."""
     moved: float
-    """How much later than wanted these were, in seconds, on average."""
+    """Mean delay of these dates after the wanted starts, in seconds."""
     at_once: float
-    """The same ones without bookings: share that began when they asked."""
+    """Share of the same ARCs that begin when they ask, in the run without bookings."""
     wait: float
-    """Mean wait of those that are booked at no share, in seconds."""
+    """Mean wait in seconds of the ARCs that are not booked in any run."""
     longest: float
 
 
@@ -226,17 +228,17 @@ def _row(trials: Sequence[BookingTrial], by_job: Mapping[BookingJob, BookingTria
     def without(trial: BookingTrial) -> BookingTrial:
         return by_job[BookingJob(trial.job.family, trial.job.seed, 0.0)]
 
-    others = [wait for one in trials for arc, wait in one.wait.items() if arc not in largest(one).moved]
-    booked = [(one, arc) for one in trials for arc in one.moved]
+    others = [wait for trial in trials for arc, wait in trial.wait.items() if arc not in largest(trial).moved]
+    booked = [(trial, arc) for trial in trials for arc in trial.moved]
     return BookingsRow(
         share=trials[0].job.share,
         booked=len(booked) / len(trials),
-        in_use=statistics.fmean(one.in_use for one in trials),
-        lost=statistics.fmean(one.lost for one in trials),
-        thrown_away=statistics.fmean(one.thrown_away for one in trials),
-        at_date=_share([one.wait.get(arc) == 0 for one, arc in booked]),
-        moved=statistics.fmean(one.moved[arc] for one, arc in booked) / SECOND if booked else 0.0,
-        at_once=_share([without(one).wait.get(arc) == 0 for one, arc in booked]),
+        in_use=statistics.fmean(trial.in_use for trial in trials),
+        lost=statistics.fmean(trial.lost for trial in trials),
+        thrown_away=statistics.fmean(trial.thrown_away for trial in trials),
+        at_date=_share([trial.wait.get(arc) == 0 for trial, arc in booked]),
+        moved=statistics.fmean(trial.moved[arc] for trial, arc in booked) / SECOND if booked else 0.0,
+        at_once=_share([without(trial).wait.get(arc) == 0 for trial, arc in booked]),
         wait=statistics.fmean(others) / SECOND if others else 0.0,
         longest=max(others, default=0) / SECOND,
     )

@@ -1,7 +1,8 @@
-"""How much longer than the least do requests wait: each strategy beside a plan that knows all arrivals beforehand.
+"""The waits of each strategy compared with the least possible ones, of a plan that knows all arrivals beforehand.
 
-Small random cases by name. The plan is CP-SAT's, which needs OR-tools. It preempts nobody: work that is thrown away
-is of no use to who knows what comes. The least is that of the sum of waits, each 100 times as much per priority."""
+Small random cases with named RCs. The plan is computed by CP-SAT of OR-tools. It does not preempt, because with all
+arrivals known throwing work away never pays. It minimizes the sum of waits, in which each priority level weighs 100
+times as much as the level below."""
 
 from __future__ import annotations
 
@@ -25,13 +26,13 @@ from zscout.types import SECOND
 
 ARCS: Final = 14
 WEIGHT: Final = 100
-"""Of a wait, by priority."""
+"""Weight factor of a wait per priority level."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class ClairvoyantTrial:
-    """`least`: the weighted sum of waits that the plan found, in seconds; `proven`: it is the least there is. By
-    strategy: the weighted sum of waits, and when all was over."""
+    """`least`: the plan's weighted sum of waits in seconds; `proven`: it is the optimum. By strategy: `waits`, the
+    weighted sum of waits, and `ends`, when the last hold ended."""
 
     seed: int
     least: int
@@ -55,7 +56,7 @@ def case(seed: int, levels: int) -> Workload:
 
 
 def least(work: Workload, seconds: float) -> tuple[int, bool]:
-    """The least weighted sum of waits that is found in so long, and whether it is proven."""
+    """The least weighted sum of waits found within `seconds`, and whether it is proven to be optimal."""
     from ortools.sat.python import cp_model  # large, so imported on use
 
     model, intervals, waits = cp_model.CpModel(), dict[str, list[cp_model.IntervalVar]](), []
@@ -89,13 +90,13 @@ def run(seed: int, levels: int, seconds: float) -> ClairvoyantTrial:
 
 
 @click.command()
-@seeds_option("100", "Cases: so many, or those of seeds A to B.", MAX_SEEDS)
+@seeds_option("100", "Cases: a number, or a range of seeds A-B.", MAX_SEEDS)
 @click.option("--levels", type=click.IntRange(1, 5), default=1, show_default=True, help="Priorities.")
 @click.option("--solver", type=click.FloatRange(0.1), default=10.0, show_default=True, help="Seconds for each plan.")
 @jobs_option
 @common.json_option("Print one JSON object instead of a table.")
 def clairvoyant(seeds: range, levels: int, solver: float, processes: int | None, as_json: bool) -> None:
-    """Compares each strategy with a plan that knows all arrivals beforehand, in small random cases (needs OR-tools).
+    """Compare each strategy with a plan that knows all arrivals beforehand, in small random cases (needs OR-tools).
 
     \b
     Examples:
@@ -119,5 +120,5 @@ def clairvoyant(seeds: range, levels: int, solver: float, processes: int | None,
         for name in STRATEGIES
     ]
     proven = sum(trial.proven for trial in found)
-    title = f"Waits in parts of the least ({proven} of {len(found)} proven), and the end of the last request"
+    title = f"Waits as multiples of the least ({proven} of {len(found)} proven), and the end of the last request"
     terminal.print_table(["strategy", "wait", "end"], rows, title=title)

@@ -20,7 +20,7 @@ from zscout.cli.simulation.options import check_rrd, rrd_option
 from zscout.config.strict import BadInput
 
 MAX_SCHEDULES: Final = 5_000
-"""Trials at most: more would fill the memory with their waits."""
+"""Most trials: more would fill the memory with their waits."""
 MAX_CASES: Final = 100_000
 
 
@@ -39,7 +39,7 @@ MAX_CASES: Final = 100_000
     type=click.Choice(list(STRATEGIES)),
     help="A strategy; repeat it for several. Default: all.",
 )
-@seeds_option("5", "Workloads of each family: so many, or those of seeds A to B.")
+@seeds_option("5", "Workloads of each family: a number, or a range of seeds A-B.")
 @jobs_option
 @common.json_option("Print one JSON object instead of tables.")
 @rrd_option()
@@ -51,12 +51,12 @@ def schedule(
     as_json: bool,
     rrd: Path | None,
 ) -> None:
-    """Compares scheduling strategies on families of random workloads.
+    """Compare scheduling strategies on families of random workloads.
 
-    For each: RCs in use, waiting, preemptions, work that they throw away, time per pass; and how often the
-    paper's heuristic uses fewer RCs than the best set in the same situation, and what foretells it. A seed is
-    the same workload on every machine, and all but the times of passes comes out the same. docs/evaluation says
-    what was found.
+    For each: RCs in use, waits, preemptions and the work that they throw away, time per pass; how often the
+    paper's heuristic uses fewer RCs than the best set in the same situation, and a rule that predicts it. A seed
+    gives the same workload and results on every machine, except for the times of passes. The results are in
+    docs/evaluation.
 
     \b
     Examples:
@@ -70,7 +70,7 @@ def schedule(
     if trials > MAX_SCHEDULES:
         raise BadInput(f"--seeds: {trials} trials are more than {MAX_SCHEDULES}; ask for fewer seeds or families")
     check_rrd(rrd)
-    # numpy is wanted from here on.
+    # These modules import numpy.
     from studies.process_pool import run_trials
     from studies.scheduling.summary import Study
     from studies.scheduling.tables import print_report
@@ -99,17 +99,17 @@ def schedule(
     type=click.Choice(BOOKABLE),
     help=f"A family of workloads; repeat it for several. Default: {', '.join(DEFAULT_FAMILIES)}.",
 )
-@seeds_option("5", "Workloads of each family: so many, or those of seeds A to B.", MAX_SEEDS)
+@seeds_option("5", "Workloads of each family: a number, or a range of seeds A-B.", MAX_SEEDS)
 @jobs_option
 @common.json_option("Print one JSON object instead of tables.")
 def bookings(families: tuple[str, ...], seeds: range, processes: int | None, as_json: bool) -> None:
-    """Measures what bookings cost, and what they give to those who book.
+    """Measure the cost of bookings, and their benefit for the requests that book.
 
     The same random requests with none, a tenth, a fifth and two fifths of them booked half a minute to two
-    minutes ahead, under strategy adaptive: RCs in use, lost to bookings (idle though somebody waited whom a
-    booking kept out), work thrown away by preemption; how many of the booked began at their dates, how much
-    later these were than wanted, and how many of the same began at once without bookings; and the wait of those
-    who never book. docs/evaluation says what was found.
+    minutes ahead, under strategy adaptive: RCs in use, lost to bookings (idle while a booking kept a request
+    waiting), work thrown away by preemption; how many of the booked requests began at their dates, how much later
+    than wanted these dates were, and how many of the same requests began at once without bookings; and the wait of
+    requests that never book. The results are in docs/evaluation.
 
     \b
     Examples:
@@ -139,21 +139,21 @@ def bookings(families: tuple[str, ...], seeds: range, processes: int | None, as_
     help="A family of workloads; repeat it for several. Default: all whose requests come one after the other.",
 )
 @click.option(
-    "--strategy", type=click.Choice(list(STRATEGIES)), default="adaptive", show_default=True, help="Who schedules."
+    "--strategy", type=click.Choice(list(STRATEGIES)), default="adaptive", show_default=True, help="The strategy."
 )
-@click.option("--exact", is_flag=True, help="All ask for exactly what they take.")
-@seeds_option("5", "Workloads of each family: so many, or those of seeds A to B.", MAX_SEEDS)
+@click.option("--exact", is_flag=True, help="All ask for exactly the time that they take.")
+@seeds_option("5", "Workloads of each family: a number, or a range of seeds A-B.", MAX_SEEDS)
 @jobs_option
 @common.json_option("Print one JSON object instead of a table.")
 def forecasts(
     families: tuple[str, ...], strategy: str, exact: bool, seeds: range, processes: int | None, as_json: bool
 ) -> None:
-    """Measures how right it is what requests are told of their start, where they ask for 2 to 10 times too much.
+    """Measure the accuracy of forecast starts if requests ask for 2 to 10 times too much time.
 
-    Each ARC is a run of one of 12 programs, and asks for so many times what it takes: always about as many for
-    one program. As it is queued its start is foretold from what holds have asked for, from what was learned of
-    how long they last, and from what they will take: the best there can be, as nobody knows who comes later.
-    docs/evaluation says what was found.
+    Each ARC is a run of one of 12 programs, and asks for a multiple of the time that it takes: about the same
+    multiple for each run of a program. When it is queued its start is forecast from the requested times, from
+    learned durations, and from the true durations: the best possible forecast, as later requests are unknown.
+    The results are in docs/evaluation.
 
     \b
     Examples:
@@ -170,36 +170,36 @@ def forecasts(
     common.run(run_trials(study.run, planned, processes, trials.append))
     found = study.report(trials)
     if as_json:
-        terminal.print_json({"families": [dataclasses.asdict(one) for one in found]})
+        terminal.print_json({"families": [dataclasses.asdict(family) for family in found]})
         return
     columns = ["family", "queued", *(f"near, {way}" for way in study.WAYS), *(f"error, {way}" for way in study.WAYS)]
     rows = [
-        [one.family, str(one.queued)]
-        + [f"{one.ways[way].near:.1%}" for way in study.WAYS]
-        + [f"{one.ways[way].error:.1f} s" for way in study.WAYS]
-        for one in found
+        [family.family, str(family.queued)]
+        + [f"{family.ways[way].near:.1%}" for way in study.WAYS]
+        + [f"{family.ways[way].error:.1f} s" for way in study.WAYS]
+        for family in found
     ]
-    title = f"Starts as they were foretold by what was asked for, learned and true ({strategy})"
+    title = f"Forecasts of starts from asked, learned and true durations ({strategy})"
     terminal.print_table(columns, rows, title=title)
 
 
 @click.command()
-@seeds_option("3", "Weeks: so many, or those of seeds A to B.", MAX_SEEDS)
+@seeds_option("3", "Weeks: a number, or a range of seeds A-B.", MAX_SEEDS)
 @click.option(
     "--cases",
     type=click.IntRange(0, MAX_CASES),
     default=500,
     show_default=True,
-    help="Random fleets in which one group asks otherwise than it needs.",
+    help="Random fleets in which one group asks for more than it needs, or splits its requests.",
 )
 @jobs_option
 @common.json_option("Print one JSON object instead of tables; it has the seeds of all cases in which it was of use.")
 def shares(seeds: range, cases: int, processes: int | None, as_json: bool) -> None:
-    """Measures fair shares: how equal two groups come out, and whether it is of use to inflate or split requests.
+    """Measure fair shares: how equal two groups come out, and whether inflating or splitting requests pays.
 
     A week of 10 RCs, with fair shares and without: one group is always at work, the other comes in bursts of 20.
-    Then random fleets for an hour each, in which one group asks for more time than it needs, splits what it asks
-    for, or asks for everything besides: does it get more of use? docs/evaluation says what was found.
+    Then random fleets for an hour each, in which one group asks for more time than it needs, splits its requests,
+    or requests all RCs as well: does it get more useful RC-seconds? The results are in docs/evaluation.
 
     \b
     Examples:
@@ -236,7 +236,7 @@ def shares(seeds: range, cases: int, processes: int | None, as_json: bool) -> No
     show_default=True,
     help="One priority for all, or a higher one for system personnel.",
 )
-@click.option("--first", type=click.IntRange(1), help="Only so many jobs. Default: all.")
+@click.option("--first", type=click.IntRange(1), help="Number of jobs. Default: all.")
 @click.option("--places", type=click.IntRange(0), default=0, help="Other places for programs. Default: 0.")
 @jobs_option
 @common.json_option("Print one JSON object instead of a table.")
@@ -249,11 +249,11 @@ def traces(
     processes: int | None,
     as_json: bool,
 ) -> None:
-    """Plays a job trace (Standard Workload Format, .swf or .swf.gz) on 32 exclusive devices.
+    """Play a job trace (Standard Workload Format, .swf or .swf.gz) on 32 exclusive devices.
 
-    The strategies beside EASY backfill, conservative backfill and shortest first: waits in ratios to EASY, device time
-    that preemption threw away, processor time per event. Runtimes are what was asked for. docs/scheduling.md says what
-    was found on the NASA iPSC log of the Parallel Workloads Archive.
+    The strategies are compared with EASY backfill, conservative backfill and shortest first: waits as ratios to EASY,
+    device time that preemption threw away, processor time per event. Jobs ask for exactly their runtimes. The results
+    for the NASA iPSC log of the Parallel Workloads Archive are in docs/scheduling.md.
 
     \b
     Examples:

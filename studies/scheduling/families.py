@@ -1,7 +1,7 @@
-"""Families of random workloads. One seed of one family is the same workload on every machine.
+"""Families of random workloads. A seed of a family gives the same workload on every machine.
 
-A stream's load is exact: the RC-seconds that its ARCs ask of the exclusive RCs, as a share of what these have
-until the last request. Requests come as a Poisson process does, given how many there are.
+A stream's load is exact: the requested RC-seconds of exclusive RCs, divided by the available ones until the last
+request. Arrivals are those of a Poisson process with a given number of requests.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class Family:
 
 @dataclass(frozen=True, slots=True)
 class Mix:
-    """What the ARCs of a family are like. `widths` and `priorities` are drawn with equal chance."""
+    """The ARCs of a family. `widths` and `priorities` are drawn with equal probability."""
 
     rcs: int = 10
     arcs: int = 400
@@ -51,9 +51,9 @@ class Mix:
     burst: int = 1
     """ARCs that ask at the same instant."""
     radios: int = 0
-    """Sharable RCs besides; every ARC uses one."""
+    """Additional sharable RCs; every ARC uses one."""
     operators: float = 0.0
-    """Share of ARCs that are an operator's: priority 10, one or two RCs."""
+    """Share of operators' ARCs, with priority 10 and one or two RCs."""
 
 
 def _robots(count: int) -> list[RcName]:
@@ -87,7 +87,7 @@ def at_once(mix: Mix, random: Random) -> Workload:
 
 
 def stream(mix: Mix, random: Random) -> Workload:
-    """They come one after the other, or in bursts, at the mix's load."""
+    """ARCs arrive one after the other, or in bursts, at the mix's load."""
     requests = _requests(mix, random)
     exclusive = set(_robots(mix.rcs))
     work = sum(request.min_runtime * len(exclusive & request.needs.keys()) for request in requests)
@@ -99,10 +99,10 @@ def stream(mix: Mix, random: Random) -> Workload:
 
 
 def wide_among_narrow(random: Random) -> Workload:
-    """A few need 8 of the 10 RCs for long; the many others need one, shortly."""
+    """A few ARCs need 8 of the 10 RCs for a long time; many others need one for a short time."""
     wide = stream(Mix(arcs=10, widths=(8,), mean_runtime=20.0, load=0.2), random)
     narrow = stream(Mix(arcs=640, widths=(1,), mean_runtime=5.0, load=0.4), random)
-    # Each has its own length: the shorter is stretched over the time of the longer.
+    # The shorter stream is stretched to the length of the longer.
     ends = [part.arrivals[-1].at for part in (wide, narrow)]
     arrivals = [
         Arrival(arrival.at * max(ends) // end // MILLISECOND * MILLISECOND, _renamed(arrival.request, prefix))

@@ -1,9 +1,9 @@
-"""How good forecasts are where people ask for more time than they need: with what was asked for, with what was learned
-(`runtimes.py`), and with the true runtimes.
+"""The accuracy of forecasts if people ask for more time than they need: from the requested times, from learned
+runtimes (`runtimes.py`), and from the true runtimes.
 
-Each ARC of a workload is a run of one of a few programs, and asks for so many times what it takes: always about as many
-for one program. When it is first queued it is foretold its start, in each of the ways; what is told changes nothing of
-the run."""
+Each ARC of a workload is a run of one of a few programs, and asks for a multiple of the time that it takes: about the
+same multiple for all runs of a program. When it is first queued, its start is forecast in each way. Forecasts do not
+change the run."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ from zscout.types import SECOND, ArcId, Ns
 
 PROGRAMS: Final = 12
 FACTORS: Final = (2.0, 10.0)
-"""Between these is by how many times a program asks for too much."""
+"""Range of the programs' factors by which they ask for too much time."""
 NOISE: Final = 0.2
-"""By this share a single request differs from its program's factor at most."""
+"""Largest relative deviation of a single request from its program's factor."""
 NEAR: Final = 0.2
-"""What starts within this share of the wait that was told counts as foretold right."""
+"""A forecast is right if the start is within this share of the forecast wait."""
 WAYS: Final = ("asked", "learned", "true")
 
 
@@ -41,12 +41,13 @@ class ForecastJob:
     seed: int
     strategy: str
     exact: bool = False
-    """Whether all ask for exactly what they take."""
+    """True if all ask for exactly the time that they take."""
 
 
 @dataclass(frozen=True, slots=True)
 class ForetoldStart:
-    """What an ARC was told when it was first queued, and what came: waits in ns. None: that it never starts."""
+    """The forecast and true waits of an ARC from when it was first queued, in ns. None: a forecast that it never
+    starts."""
 
     waits: tuple[Ns | None, ...]
     """In the order of `WAYS`."""
@@ -56,15 +57,15 @@ class ForetoldStart:
 @dataclass(frozen=True, slots=True)
 class ForecastTrial:
     job: ForecastJob
-    told: tuple[ForetoldStart, ...]
+    foretold: tuple[ForetoldStart, ...]
 
 
 @dataclass(frozen=True, slots=True)
 class Accuracy:
     near: float
-    """Share of the ARCs that were queued: those that started within `NEAR` of the wait that they were told."""
+    """Share of the queued ARCs that started within `NEAR` of the forecast wait."""
     error: float
-    """The median, in seconds, of those that were told one."""
+    """Median error in seconds of the ARCs with a forecast wait."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,7 +85,8 @@ class _TrueRuntimes(RuntimeEstimator):
 
 
 def overestimated(workload: Workload, random: Random, *, exact: bool = False) -> tuple[Workload, Mapping[ArcId, Ns]]:
-    """The same as runs of programs that ask for too much time, unless `exact`; and what each ARC takes, in ns."""
+    """Return the workload as runs of programs that ask for too much time, unless `exact`; and the ns that each ARC
+    takes."""
     factors = [random.uniform(*FACTORS) for _ in range(PROGRAMS)]
     arrivals = []
     for arrival in workload.arrivals:
@@ -97,13 +99,13 @@ def overestimated(workload: Workload, random: Random, *, exact: bool = False) ->
 
 
 def run(job: ForecastJob) -> ForecastTrial:
-    """Raises KeyError for a family or strategy that does not exist."""
+    """Raises KeyError for an unknown family or strategy."""
     random = Random(f"{job.family}/{job.seed}/asked")  # noqa: S311 - workloads, not secrets
     workload, lasting = overestimated(FAMILIES[job.family].workload(job.seed), random, exact=job.exact)
     requests = {arrival.request.arc: arrival.request for arrival in workload.arrivals}
     learned, true = RuntimeEstimator(), _TrueRuntimes(lasting)
     queued: dict[ArcId, Ns] = {}
-    told: dict[ArcId, tuple[Ns | None, ...]] = {}
+    foretold: dict[ArcId, tuple[Ns | None, ...]] = {}
     started: dict[ArcId, Ns] = {}
     since: dict[ArcId, Ns] = {}
 
@@ -119,35 +121,35 @@ def run(job: ForecastJob) -> ForecastTrial:
                     queued.setdefault(arc, now)
         if any(isinstance(effect, Propose) for effect in effects):
             return
-        new = [arc for arc in queued if arc not in told and arc not in started]
+        new = [arc for arc in queued if arc not in foretold and arc not in started]
         if not new:
             return
         found = [forecast(core, now, runtimes=runtimes).starts for runtimes in (None, learned, true)]
         for arc in new:
-            told[arc] = tuple(starts[arc] - now if arc in starts else None for starts in found)
+            foretold[arc] = tuple(starts[arc] - now if arc in starts else None for starts in found)
 
     replay(workload, watch, strategy=STRATEGIES[job.strategy](), lasting=lasting)
-    found = (ForetoldStart(waits, started[arc] - queued[arc]) for arc, waits in told.items() if arc in started)
+    found = (ForetoldStart(waits, started[arc] - queued[arc]) for arc, waits in foretold.items() if arc in started)
     return ForecastTrial(job, tuple(found))
 
 
-def accuracy(told: Sequence[tuple[Ns | None, Ns]]) -> Accuracy:
-    """Of pairs of the wait that was told and that which came."""
-    errors = [abs(waited - wait) for wait, waited in told if wait is not None]
-    near = sum(wait is not None and abs(waited - wait) <= NEAR * wait for wait, waited in told)
-    return Accuracy(near / len(told) if told else 0.0, median(errors) / SECOND if errors else 0.0)
+def accuracy(foretold: Sequence[tuple[Ns | None, Ns]]) -> Accuracy:
+    """The accuracy of pairs of forecast wait and true wait."""
+    errors = [abs(waited - wait) for wait, waited in foretold if wait is not None]
+    near = sum(wait is not None and abs(waited - wait) <= NEAR * wait for wait, waited in foretold)
+    return Accuracy(near / len(foretold) if foretold else 0.0, median(errors) / SECOND if errors else 0.0)
 
 
 def report(trials: Iterable[ForecastTrial]) -> list[FamilyForecasts]:
     """By family, in the order of the trials."""
     families: dict[str, list[ForetoldStart]] = {}
     for trial in trials:
-        families.setdefault(trial.job.family, []).extend(trial.told)
+        families.setdefault(trial.job.family, []).extend(trial.foretold)
     return [
         FamilyForecasts(
             family,
-            len(told),
-            {name: accuracy([(one.waits[way], one.waited) for one in told]) for way, name in enumerate(WAYS)},
+            len(foretold),
+            {name: accuracy([(start.waits[way], start.waited) for start in foretold]) for way, name in enumerate(WAYS)},
         )
-        for family, told in families.items()
+        for family, foretold in families.items()
     ]

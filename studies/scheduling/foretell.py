@@ -1,9 +1,9 @@
-"""Can one tell beforehand that the heuristic will be behind? Plain statistics, checked on data not fitted to.
+"""Can a cheap rule predict that the heuristic will be behind? Plain statistics, checked on other data than fitted.
 
 Each feature's correlation with "behind" (Pearson's; "behind" counts 0 or 1), and the best rule of one or two
-thresholds. A rule is chosen on one half of the situations by the mean of the two rates at which it is right
-(where the heuristic is behind, and where it is not), so that answering "never" does not win; its hit rate is
-counted on the other half and stands beside the rate of always giving the commoner answer.
+thresholds. A rule is chosen on one half of the situations by balanced accuracy: the mean of its hit rates where the
+heuristic is behind and where it is not, so that "never" does not win. Its hit rate is counted on the other half, and
+compared with the rate of always giving the commoner answer.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ Matrix: TypeAlias = npt.NDArray[np.float64]
 Flags: TypeAlias = npt.NDArray[np.bool_]
 
 THRESHOLDS: Final = 39
-"""Thresholds that are tried for each feature: its quantiles."""
+"""Number of thresholds tried for each feature: its quantiles."""
 FEWEST: Final = 20
-"""Situations of each kind, on each side, below which no rule is fitted."""
+"""Situations of each kind, in each half, below which no rule is fitted."""
 GAIN: Final = 0.01
-"""What a second condition must add on the fitted half to be worth having."""
+"""Least gain of a second condition on the fitted half."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,27 +47,27 @@ class Condition:
 
 @dataclass(frozen=True, slots=True)
 class Rule:
-    """The heuristic is behind where all conditions hold; the figures are of the half not fitted to."""
+    """Predicts that the heuristic is behind if all conditions hold. The figures are from the half not used to fit."""
 
     conditions: tuple[Condition, ...]
     situations: int
     hit_rate: float
     """Share of the situations in which the rule is right."""
     base_rate: float
-    """The same for always giving the commoner answer."""
+    """Hit rate of always giving the commoner answer."""
     named: float
-    """Share of the situations that the rule names: those in which a search would be made."""
+    """Share of the situations that the rule names, in which a search would be made."""
     found: float
-    """Share of the situations where the heuristic is behind that the rule names."""
+    """Share of named situations among those where the heuristic is behind."""
     precision: float
-    """Share of those named where it is true."""
+    """Share of situations where the heuristic is behind among those named."""
 
     def __str__(self) -> str:
         return " and ".join(map(str, self.conditions))
 
 
 def correlations(features: Matrix, behind: Flags) -> dict[str, float | None]:
-    """By feature; None where nothing varies. `features` has a row for each situation."""
+    """The correlation by feature; None if a column is constant. `features` has a row for each situation."""
     found: dict[str, float | None] = {}
     for name, column in zip(FEATURES, features.T, strict=True):
         varies = len(column) > 1 and column.std() > 0 and behind.any() and not behind.all()
@@ -76,7 +76,7 @@ def correlations(features: Matrix, behind: Flags) -> dict[str, float | None]:
 
 
 def fit(features: Matrix, behind: Flags, fitted: Flags) -> Rule | None:
-    """The best rule on the rows marked in `fitted`, judged on the others. None where there are too few."""
+    """The best rule on the rows marked in `fitted`, judged on the others. None if there are too few rows."""
     known, truth = features[fitted], behind[fitted]
     others, outcome = features[~fitted], behind[~fitted]
     kinds = (truth.sum(), (~truth).sum(), outcome.sum(), (~outcome).sum())

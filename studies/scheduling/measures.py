@@ -1,4 +1,4 @@
-"""What a replayed workload is worth: RCs in use, waiting, preemptions, work thrown away."""
+"""Measures of a replayed workload: RCs in use, waits, preemptions, work thrown away."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ from zscout.types import ArcId, Ns, RcName
 class Measures:
     """One run. Times in ns, shares from 0 to 1.
 
-    An ARC's wait lasts from its request to the start of the hold that it completes: what it did in one that
-    was taken away has to be done again."""
+    An ARC's wait lasts from its request to the start of the hold that it completes, because work in a hold that was
+    taken away must be done again."""
 
     in_use: float
-    """Mean share of RCs that are held: until the last request, or the last end if all ask at once."""
+    """Mean share of held RCs until the last request, or until the last end if all ask at once."""
     first: float
     """Share of the RCs that are held after the first instant."""
     waits: tuple[Ns, ...]
-    """Of the ARCs that were served, in the order of the workload."""
+    """Waits of the served ARCs, in the order of the workload."""
     unserved: int
     preemptions: int
     thrown_away: float
-    """RC-time in holds that were taken away, by RC-time held in all."""
+    """RC-time in holds that were taken away, divided by all held RC-time."""
     end: Ns
     """When the last hold ends."""
 
@@ -68,7 +68,7 @@ def measure(workload: Workload, played: Replay) -> Measures:
 
 
 def spans_in_use(holds: Iterable[HoldRecord]) -> dict[RcName, list[tuple[Ns, Ns]]]:
-    """When each RC has a holder: spans in order that neither overlap nor touch."""
+    """The spans in which each RC has a holder, in order; spans neither overlap nor touch."""
     found: defaultdict[RcName, list[tuple[Ns, Ns]]] = defaultdict(list)
     for hold in sorted(holds, key=lambda hold: hold.start):
         for rc in hold.rcs:
@@ -82,7 +82,7 @@ def spans_in_use(holds: Iterable[HoldRecord]) -> dict[RcName, list[tuple[Ns, Ns]
 
 @dataclass(frozen=True, slots=True)
 class Curve:
-    """A run over time: from each of `times` (ns) on, so many RCs are held and so many ARCs wait."""
+    """A run over time: the numbers of held RCs and of waiting ARCs from each of `times` (ns) on."""
 
     times: tuple[Ns, ...]
     used: tuple[int, ...]

@@ -25,30 +25,30 @@ BARS: Final = (
 
 
 def record(path: Path, report: SchedulingReport, curves: Mapping[tuple[str, str], Curve]) -> None:
-    """Writes the recording, replacing what was there. `curves` are by family and strategy.
+    """Write the recording, and replace an existing file. `curves` are by family and strategy.
 
-    Raises BadInput where the file can't be written."""
+    Raises BadInput if the file can't be written."""
     import rerun as rr
 
     with recording(path, APPLICATION, _blueprint(report, curves), _words(report)) as stream:
         for family in report.families:
-            for number, one in enumerate(family.strategies):
+            for number, strategy in enumerate(family.strategies):
                 colour = COLOURS[number % len(COLOURS)]
                 for field, _, factor in BARS:
-                    bar = rr.BarChart([getattr(one, field) * factor], abscissa=[number], color=colour)
-                    stream.log(f"{family.family}/{field}/{one.strategy}", bar, static=True)
-                drawn = curves.get((family.family, one.strategy))
+                    bar = rr.BarChart([getattr(strategy, field) * factor], abscissa=[number], color=colour)
+                    stream.log(f"{family.family}/{field}/{strategy.strategy}", bar, static=True)
+                drawn = curves.get((family.family, strategy.strategy))
                 if drawn is None:
                     continue
                 look = rr.SeriesLines(
                     colors=[colour],
-                    names=[one.strategy],
+                    names=[strategy.strategy],
                     widths=[1.5],
                     interpolation_mode=rr.components.InterpolationMode.StepAfter,
                 )
                 for name, values in (("used", drawn.used), ("waiting", drawn.waiting)):
                     points = [(at, float(value)) for at, value in zip(drawn.times, values, strict=True)]
-                    draw_curve(stream, f"{family.family}/{name}/{one.strategy}", look, points)
+                    draw_curve(stream, f"{family.family}/{name}/{strategy.strategy}", look, points)
 
 
 def _blueprint(report: SchedulingReport, curves: Mapping[tuple[str, str], Curve]) -> rrb.Blueprint:
@@ -69,7 +69,7 @@ def _blueprint(report: SchedulingReport, curves: Mapping[tuple[str, str], Curve]
             )
             for name, title in (("used", "RCs in use"), ("waiting", "ARCs that wait"))
         ]
-        # The curves' legend says whose colour it is; the bars' would cover them.
+        # The legend of the curves also explains the bars, which a legend of their own would cover.
         bars = [
             rrb.BarChartView(origin=f"/{family.family}/{field}", name=title, plot_legend=rrb.PlotLegend(visible=False))
             for field, title, _ in BARS
@@ -85,13 +85,13 @@ def _words(report: SchedulingReport) -> str:
         lines += ["", f"## {family.family}", family.summary, ""]
         lines += ["| strategy | in use | mean wait | longest | thrown away |", "|---|---|---|---|---|"]
         lines += [
-            f"| {one.strategy} | {one.in_use:.1%} | {one.wait_mean:.1f} s | {one.wait_longest:.0f} s "
-            f"| {one.thrown_away:.1%} |"
-            for one in family.strategies
+            f"| {row.strategy} | {row.in_use:.1%} | {row.wait_mean:.1f} s | {row.wait_longest:.0f} s "
+            f"| {row.thrown_away:.1%} |"
+            for row in family.strategies
         ]
         if (found := family.degenerate) is not None:
             lines += ["", f"`priority` is behind in {found.behind / found.situations:.1%} of situations."]
     if report.rule is not None:
         rule = report.rule
-        lines += ["", "## What foretells it", f"`{rule}`: right in {rule.hit_rate:.1%} of other seeds' cases."]
+        lines += ["", "## Prediction", f"`{rule}`: right in {rule.hit_rate:.1%} of other seeds' cases."]
     return "\n".join(lines)

@@ -1,5 +1,5 @@
-"""Programs that ask for one ARC after the other, played through the core under virtual time: the next is asked for when
-the one before is over, as programs do, so that what a group gets decides what it asks for next."""
+"""Programs that request one ARC after the other, played through the core under virtual time. As in real programs, each
+request follows the end of the previous one, so a group's later requests depend on its earlier grants."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from zscout.types import SECOND, ArcId, Ns, Params, RcName
 
 
 class ProgramJob(NamedTuple):
-    """One ARC of a program: asked for `pause` ns after the one before was over, for `asked` ns, of which `used` are of
-    use; what is used less is given back early."""
+    """An ARC of a program: requested `pause` ns after the end of the previous ARC, for `asked` ns. After `used` ns its
+    work is done; if that is less, it is released early."""
 
     pause: Ns
     rcs: tuple[RcName, ...]
@@ -28,7 +28,7 @@ class ProgramJob(NamedTuple):
 
 @dataclass(slots=True)
 class Use:
-    """What a group had: RC-seconds of use, and those that were charged; waits in seconds."""
+    """A group's useful and charged RC-seconds; waits in seconds."""
 
     useful: float = 0.0
     charged: float = 0.0
@@ -44,7 +44,7 @@ class Use:
 @dataclass(slots=True)
 class _Program:
     name: str
-    """Unique in its run, and the same each time."""
+    """Unique in its run, and the same in each run."""
     group: str
     jobs: Iterator[ProgramJob]
     job: ProgramJob
@@ -56,9 +56,9 @@ class _Program:
 class _Run:
     core: Core
     programs: dict[ArcId, _Program] = field(default_factory=dict)
-    """By the ARC that each has asked for."""
+    """By the ARC that a program has requested."""
     coming: list[tuple[Ns, int, _Program | ArcId | None]] = field(default_factory=list)
-    """A heap: a program asks, an ARC gives back, or (None) a minimum runtime is over."""
+    """A heap of events: a program requests, an ARC is released, or (None) a minimum runtime is over."""
     pushed: int = 0
     uses: dict[str, Use] = field(default_factory=dict)
     begun: dict[ArcId, Ns] = field(default_factory=dict)
@@ -67,7 +67,7 @@ class _Run:
         self.pushed += 1
         heapq.heappush(self.coming, (at, self.pushed, what))
 
-    def go_on(self, program: _Program, now: Ns) -> None:
+    def ask_next(self, program: _Program, now: Ns) -> None:
         job = next(program.jobs, None)
         if job is not None:
             program.job, program.number = job, program.number + 1
@@ -96,7 +96,7 @@ class _Run:
                 program = self.programs.pop(arc)
                 self.used(program, arc, now)
                 self.uses[program.group].done += 1
-                self.go_on(program, now)
+                self.ask_next(program, now)
             case _:
                 pass
 
@@ -108,12 +108,13 @@ class _Run:
 def play(
     rcs: Sequence[RcName], groups: Mapping[str, Sequence[Iterator[ProgramJob]]], policy: SchedulingPolicy, until: Ns
 ) -> dict[str, Use]:
-    """What each group had by then. Strategy `adaptive`, exclusive RCs, one priority; a group's name is its host's."""
+    """Return the use of each group until `until`. Strategy `adaptive`, exclusive RCs, a single priority. A group is
+    named like its host."""
     run = _Run(Core(Adaptive(), policy), uses={group: Use() for group in groups})
     for group, programs in groups.items():
         for number, jobs in enumerate(programs):
             program = _Program(f"{group}/{number}", group, jobs, ProgramJob(0, (), 0, 0))
-            run.go_on(program, 0)
+            run.ask_next(program, 0)
     now: Ns = 0
     events: list[model.Event] = [model.RcJoined(rc, sharable=False) for rc in rcs]
     while True:

@@ -1,9 +1,9 @@
-"""Fair shares by measurement: a week of two groups one of which comes in bursts, and whether it is of use to a group to
-ask for more than it needs, or for less at a time.
+"""Fair shares, measured: a week of two groups, one of which asks in bursts; and cases that show whether a group profits
+from asking for more than it needs, or from splitting its requests.
 
-A case of the second is a small fleet, drawn from a seed, whose groups are always at work; in it one group changes how
-it asks, and nothing else is changed. What counts is its part of all RC-seconds of use. As any change changes the luck
-of a run, one way is none: the group begins a second later.
+A case is a small fleet, drawn from a seed, whose groups are always at work. Only one group changes how it asks. Its
+result is its part of all useful RC-seconds. Because any change alters the luck of a run, one way of asking serves as
+control: the group begins a second later.
 """
 
 from __future__ import annotations
@@ -26,21 +26,21 @@ WEEK_RCS: Final = [f"robot/r{number}" for number in range(10)]
 MEAN: Final = 120.0
 """Seconds of an ARC in the week; exponential, 10 s to an hour."""
 PROGRAMS: Final = 12
-"""Of the steady group; each pauses for half a minute in the mean."""
+"""Programs of the steady group; their mean pause is half a minute."""
 BURST: Final = 20
-"""ARCs that the bursty group asks for at one instant,"""
+"""ARCs that the bursty group requests at the same instant."""
 BURSTS: Final = 252
-"""so often in the week, whenever it is: a fifth of all RC-seconds there are."""
+"""Bursts in the week, at random times: together a fifth of all RC-seconds."""
 EQUAL: Final = 1e15
-"""Weights so great that all shares are equal: charged is what would be, and the order is that without fair shares."""
+"""Weights so large that all shares are equal: use is charged, but the order is as without fair shares."""
 GAMER: Final = "gamer"
 SHORT: Final[Ns] = SECOND // 1_000
 RISE: Final = 0.05
-"""A part that grows by more than this part of itself has risen."""
+"""A part has risen if it grows by more than this part of itself."""
 
 
 class Week(NamedTuple):
-    """What to play: `fair` None without fair shares."""
+    """A week to play, with fair shares if `fair`."""
 
     seed: int
     fair: bool
@@ -53,7 +53,7 @@ class WeekTrial:
 
     @property
     def apart(self) -> float:
-        """How far the charged RC-seconds of the two are apart, as a part of their mean."""
+        """Difference between the charged RC-seconds of the two groups, divided by their mean."""
         steady, bursty = self.uses[STEADY].charged, self.uses[BURSTY].charged
         return abs(steady - bursty) / ((steady + bursty) / 2)
 
@@ -64,7 +64,7 @@ def play_week(job: Week) -> WeekTrial:
     times = [random.randrange(DAYS * DAY // SECOND) * SECOND for _ in range(BURSTS)]
     bursty = [iter([_job(random, WEEK_RCS, MEAN, at)]) for at in times for _ in range(BURST)]
     weights = {} if job.fair else {STEADY: EQUAL, BURSTY: EQUAL}
-    # A patience that follows the runtimes is longer than these waits: then nobody is due.
+    # A patience that follows the runtimes would be longer than these waits, so that no request became due.
     policy = SchedulingPolicy(patience=PATIENCE, fair_shares=FairShares(DAY, weights))
     return WeekTrial(job, play(WEEK_RCS, {STEADY: steady, BURSTY: bursty}, policy, DAYS * DAY))
 
@@ -79,7 +79,7 @@ def _endless(random: Random, rcs: Sequence[RcName], mean: float, pause: float) -
         yield _job(random, rcs, mean, round(random.expovariate(1 / pause)) * SECOND)
 
 
-# Whether it is of use to ask otherwise than one needs
+# Does a group profit from asking for other things than it needs?
 
 Programs = list[Iterator[ProgramJob]]
 Way = Callable[[Sequence[int], Callable[[int], Iterator[ProgramJob]], "SharesCase"], Programs]
@@ -87,8 +87,8 @@ Way = Callable[[Sequence[int], Callable[[int], Iterator[ProgramJob]], "SharesCas
 
 @dataclass(frozen=True, slots=True)
 class SharesCase:
-    """A fleet and its groups: by group the seeds of its programs. `factor`: by how much is asked for more, or in how
-    many pieces."""
+    """A fleet. `groups`: the seeds of the programs by group. `factor`: of inflated requests, or the number of pieces of
+    split ones."""
 
     seed: int
     rcs: tuple[RcName, ...]
@@ -169,8 +169,8 @@ WAYS: Final[Mapping[str, Way]] = {
 
 @dataclass(frozen=True, slots=True)
 class CaseTrial:
-    """The gamer's part of all RC-seconds of use, if it asks for what it needs, and if not; with fair shares and
-    without."""
+    """The gamer's part of all useful RC-seconds, if it asks `honest` and if it does not, with fair shares and without
+    (`off`)."""
 
     case: SharesCase
     honest: float
@@ -180,7 +180,7 @@ class CaseTrial:
 
     @property
     def rise(self) -> float:
-        """By which part of itself its part grows with fair shares."""
+        """Relative growth of the gamer's part with fair shares."""
         return self.gamed / self.honest - 1 if self.honest else 0.0
 
 
@@ -201,7 +201,7 @@ def _part(case: SharesCase, way: Way, policy: SchedulingPolicy) -> float:
     return uses[GAMER].useful / total if total else 0.0
 
 
-# What came of it
+# Results
 
 
 @dataclass(frozen=True, slots=True)
@@ -214,8 +214,9 @@ class WeekReport:
 
 @dataclass(frozen=True, slots=True)
 class Changes:
-    """In which part of the cases the gamer's part rose and fell by more than `RISE` of itself, and in which it rose to
-    more than that beyond an equal part; by how much it changed in all; and the greatest rise, with its case."""
+    """Changes of the gamer's part over all cases. `rose`, `fell`: share of cases with a relative change above `RISE`.
+    `beyond`: of cases in which it rose, and to more than an equal part by `RISE`. `mean`: relative change of the sum.
+    `greatest`: the largest rise, and the `seed` of its case."""
 
     rose: float
     beyond: float
@@ -226,16 +227,16 @@ class Changes:
 
     @classmethod
     def of(cls, found: Sequence[tuple[SharesCase, float, float]]) -> Changes:
-        """From the parts honest and gamed."""
+        """`found`: each case with its honest and gamed parts."""
         rises = [(gamed / honest - 1 if honest else 0.0, case.seed) for case, honest, gamed in found]
         greatest, seed = max(rises)
-        honest = sum(one for _, one, _ in found)
+        honest = sum(part for _, part, _ in found)
         beyond = [gamed * len(case.groups) > 1 + RISE for case, _, gamed in found]
         return cls(
             sum(rise > RISE for rise, _ in rises) / len(found),
             sum(rise > RISE and far for (rise, _), far in zip(rises, beyond, strict=True)) / len(found),
             sum(rise < -RISE for rise, _ in rises) / len(found),
-            sum(one for _, _, one in found) / honest - 1 if honest else 0.0,
+            sum(gamed for _, _, gamed in found) / honest - 1 if honest else 0.0,
             greatest,
             seed,
         )
@@ -243,7 +244,7 @@ class Changes:
 
 @dataclass(frozen=True, slots=True)
 class WayReport:
-    """All cases of one way, with fair shares and without."""
+    """All cases of a way of asking, with fair shares and without."""
 
     way: str
     cases: int
@@ -256,21 +257,21 @@ class SharesReport:
     weeks: list[WeekReport]
     ways: list[WayReport]
     risen: dict[str, list[int]]
-    """By way: the seeds of the cases in which a part rose with fair shares."""
+    """Seeds of the cases in which the gamer's part rose with fair shares, by way."""
 
 
 def report(weeks: Sequence[WeekTrial], cases: Sequence[CaseTrial]) -> SharesReport:
-    by_way = {way: found for way in WAYS if (found := [one for one in cases if one.case.way == way])}
+    by_way = {way: found for way in WAYS if (found := [case for case in cases if case.case.way == way])}
     return SharesReport(
-        [WeekReport(one.job.seed, one.job.fair, one.apart, one.uses) for one in weeks],
+        [WeekReport(week.job.seed, week.job.fair, week.apart, week.uses) for week in weeks],
         [
             WayReport(
                 way,
                 len(found),
-                Changes.of([(one.case, one.honest, one.gamed) for one in found]),
-                Changes.of([(one.case, one.honest_off, one.gamed_off) for one in found]),
+                Changes.of([(case.case, case.honest, case.gamed) for case in found]),
+                Changes.of([(case.case, case.honest_off, case.gamed_off) for case in found]),
             )
             for way, found in by_way.items()
         ],
-        {way: [one.case.seed for one in found if one.rise > RISE] for way, found in by_way.items()},
+        {way: [case.case.seed for case in found if case.rise > RISE] for way, found in by_way.items()},
     )

@@ -1,8 +1,8 @@
-"""How often a strategy is degenerate: one instant at a time, against the best that could be done there.
+"""How often a strategy is degenerate: each instant compared with the best result possible there.
 
-A *situation* is an instant at which somebody still waits when the pass is over. What stood before the pass
-is given to a core with strategy `optimal`; both outcomes are then compared as the design does: (ARC, RC)
-pairs in use by priority, highest first. `Situation.behind`: the strategy's outcome is the lesser one.
+A *situation* is an instant after whose pass an ARC still waits. The state before the pass is given to a core with
+strategy `optimal`, and both outcomes are compared as in the design: (ARC, RC) pairs in use by priority, highest first.
+`Situation.behind`: the strategy's outcome is worse.
 """
 
 from __future__ import annotations
@@ -35,18 +35,18 @@ FEATURES: Final = (
     "narrow first",
     "unreached",
 )
-"""What is known of a situation without searching, in the order of `Situation.features`:
+"""Features of a situation that need no search, in the order of `Situation.features`:
 
 - waiting: ARCs in the queue before the pass;
-- pressure: RCs that they need, counted for each, by RCs in all;
-- mean width: RCs that one of them needs;
-- levels: different priorities among them;
-- sharable needs: share of what they need that is sharable;
-- free before: exclusive RCs that nobody held, by exclusive RCs in all;
-- startable: those among them whose exclusive RCs are free, or held by lower priority;
-- clashes: pairs of startable ones that need the same exclusive RC;
-- narrow first: RCs by which the best-ranked startable one is narrower than the widest that it clashes with;
-- unreached: exclusive RCs that a startable one needs and nobody holds after the pass.
+- pressure: sum of the RCs that they need, divided by the number of RCs;
+- mean width: mean number of RCs that they need;
+- levels: number of different priorities among them;
+- sharable needs: share of sharable RCs in their needs;
+- free before: share of exclusive RCs without a holder;
+- startable: waiting ARCs whose exclusive RCs are free, or held by lower priority;
+- clashes: pairs of startable ARCs that need the same exclusive RC;
+- narrow first: RCs by which the best-ranked startable ARC is narrower than the widest ARC that it clashes with;
+- unreached: exclusive RCs that a startable ARC needs, without a holder after the pass.
 """
 
 TERM: Final = Term(1_000_000_000, "study")
@@ -54,7 +54,7 @@ TERM: Final = Term(1_000_000_000, "study")
 
 @dataclass(frozen=True, slots=True)
 class Situation:
-    """One instant: pairs in use after the strategy's pass and after the best one, in all levels together."""
+    """An instant: pairs in use after the strategy's pass and after the best pass, of all levels together."""
 
     features: tuple[float, ...]
     used: int
@@ -63,7 +63,7 @@ class Situation:
 
     @property
     def ratio(self) -> float:
-        """What is in use by what could be; above 1 where the best set serves higher priorities with fewer."""
+        """Pairs in use divided by the best; above 1 if the best set serves higher priorities with fewer pairs."""
         return self.used / self.best if self.best else 1.0
 
 
@@ -78,7 +78,7 @@ class _Before:
 
 
 class Observer:
-    """Looks at the floor before and after each pass, and judges every situation against the best.
+    """Observes the state before and after each pass, and compares every situation with the best.
 
     Call `before` and `after` around each pass, and `close` at the end."""
 
@@ -94,7 +94,7 @@ class Observer:
 
     def before(self, state: SchedulerState, now: Ns) -> None:
         if self._before is not None and self._before.now == now:
-            return  # votes came: the instant goes on
+            return  # after votes: still the same instant
         self.close()
         running = tuple(
             RecoveredHold(arc.request, arc.place, arc.hold.grant, arc.hold.start, arc.hold.end, arc.bound)
@@ -112,7 +112,7 @@ class Observer:
             self._unreached = (self._before.within_reach & ~state.busy).bit_count()
 
     def close(self) -> None:
-        """Judges the instant that is over."""
+        """Judge the instant that is over."""
         before, self._before = self._before, None
         if before is None or not self._waits:
             return
@@ -155,7 +155,7 @@ def _features(state: SchedulerState) -> tuple[tuple[float, ...], int]:
             if holder.request.priority >= level:
                 firm[level] |= holder.mask & exclusive
     startable = [arc.mask & exclusive for arc in queued if not arc.mask & firm[arc.request.priority]]
-    clashes = sum(bool(one & other) for one, other in itertools.combinations(startable, 2))
+    clashes = sum(bool(first & second) for first, second in itertools.combinations(startable, 2))
     rivals = [mask.bit_count() for mask in startable if mask & startable[0]]
     features = (
         float(len(queued)),

@@ -1,4 +1,4 @@
-"""Many trials put together: a line for each family and strategy, and what the heuristic loses and when."""
+"""The summary of many trials: a line for each family and strategy, and when and how much the heuristic loses."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ from studies.scheduling.trial import JUDGED, SchedulingTrial
 from zscout.types import SECOND
 
 MAX_FORETOLD: Final = 300_000
-"""Situations that are kept with their features; those of later trials only count."""
+"""Most situations that are kept with their features. Later situations are only counted."""
 MICROSECOND: Final = 1000
 
 
 @dataclass(frozen=True, slots=True)
 class Decisions:
-    """How long passes took, in microseconds: the only figures that differ from run to run."""
+    """Durations of passes in microseconds: the only figures that differ from run to run."""
 
     median: float
     p99: float
     longest: float
     first_median: float
-    """Of the first pass of each run, which is the paper's experiment where all ask at once."""
+    """Of the first pass of each run. In families that ask at once it is the paper's experiment."""
     first_p99: float
 
 
@@ -45,21 +45,21 @@ class StrategyReport:
     wait_p99: float
     wait_longest: float
     wait_longest_mean: float
-    """Each seed's longest wait, on average."""
+    """Mean of the seeds' longest waits."""
     unserved: int
     preemptions: float
-    """On average in a run."""
+    """Mean per run."""
     thrown_away: float
     end: float
-    """When the last hold of a run ends, in seconds, on average."""
+    """Mean end of a run's last hold, in seconds."""
     decision_us: Decisions
 
 
 @dataclass(frozen=True, slots=True)
 class Degeneracy:
-    """How often the heuristic is behind the best in the same situation, and how far.
+    """How often the heuristic is behind the best set in the same situation, and how far.
 
-    Ratios are pairs in use by pairs in the best set; `first` ones are of each run's first situation."""
+    Ratios: pairs in use divided by pairs in the best set; `first` ratios are from each run's first situation."""
 
     situations: int
     behind: int
@@ -77,7 +77,7 @@ class FamilyReport:
     summary: str
     strategies: tuple[StrategyReport, ...]
     degenerate: Degeneracy | None
-    """None if the heuristic was not among the strategies, or nobody ever waited."""
+    """None if the heuristic was not among the strategies, or if no request ever waited."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,10 +90,10 @@ class SchedulingReport:
 
 @dataclass(slots=True)
 class _Runs:
-    """What is kept of the trials of one family and strategy."""
+    """Collected trials of one family and strategy."""
 
     measures: list[Measures] = field(default_factory=list)
-    """Without their waits, which are kept together."""
+    """Without waits, which are in `waits`."""
     waits: array[int] = field(default_factory=lambda: array("q"))
     longest: array[int] = field(default_factory=lambda: array("q"))
     decisions: array[int] = field(default_factory=lambda: array("q"))
@@ -102,7 +102,7 @@ class _Runs:
 
 @dataclass(slots=True)
 class _Found:
-    """What is kept of the situations of one family."""
+    """Collected situations of one family."""
 
     ratios: array[float] = field(default_factory=lambda: array("d"))
     behind: array[int] = field(default_factory=lambda: array("b"))
@@ -110,12 +110,12 @@ class _Found:
 
 
 class Study:
-    """Takes trials in the order of their jobs, so that sums come out the same every time."""
+    """Collects trials in the order of their jobs, because sums of floats depend on the order."""
 
     def __init__(self, families: Sequence[str], strategies: Sequence[str], seeds: Sequence[int]) -> None:
         self.families, self.strategies, self.seeds = families, strategies, seeds
         self.curves: dict[tuple[str, str], Curve] = {}
-        """By family and strategy, of those trials that were drawn."""
+        """Curves of drawn trials, by family and strategy."""
         self._runs = {(family, strategy): _Runs() for family in families for strategy in strategies}
         self._found = {family: _Found() for family in families}
         self._features = array("d")
@@ -164,16 +164,16 @@ def _strategy(name: str, runs: _Runs) -> StrategyReport:
     measures = runs.measures
     return StrategyReport(
         strategy=name,
-        in_use=statistics.fmean(one.in_use for one in measures),
-        first=statistics.fmean(one.first for one in measures),
+        in_use=statistics.fmean(measured.in_use for measured in measures),
+        first=statistics.fmean(measured.first for measured in measures),
         wait_mean=statistics.fmean(runs.waits) / SECOND if runs.waits else 0.0,
         wait_p99=percentile(runs.waits, 0.99) / SECOND,
         wait_longest=max(runs.longest) / SECOND,
         wait_longest_mean=statistics.fmean(runs.longest) / SECOND,
-        unserved=sum(one.unserved for one in measures),
-        preemptions=statistics.fmean(one.preemptions for one in measures),
-        thrown_away=statistics.fmean(one.thrown_away for one in measures),
-        end=statistics.fmean(one.end for one in measures) / SECOND,
+        unserved=sum(measured.unserved for measured in measures),
+        preemptions=statistics.fmean(measured.preemptions for measured in measures),
+        thrown_away=statistics.fmean(measured.thrown_away for measured in measures),
+        end=statistics.fmean(measured.end for measured in measures) / SECOND,
         decision_us=Decisions(
             median=percentile(runs.decisions, 0.5) / MICROSECOND,
             p99=percentile(runs.decisions, 0.99) / MICROSECOND,

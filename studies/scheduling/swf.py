@@ -1,9 +1,8 @@
 """Job traces in the Standard Workload Format of the Parallel Workloads Archive, mapped to exclusive devices.
 
-The nodes of the machine become 32 devices of as many nodes each. Most programs (user and application) use a row of
-devices from a place of their own; the others want any few, or name many. Submissions are moved together or apart, so
-that the load is that of a shared lab. System personnel may have a higher priority.
-"""
+The nodes of the machine become 32 devices with equal numbers of nodes. Most programs (user and application) use a row
+of devices at their own place; the others ask for any few devices, or name many. The intervals between submissions are
+scaled to the load of a shared lab. System personnel may have a higher priority."""
 
 from __future__ import annotations
 
@@ -22,7 +21,7 @@ from zscout.types import SECOND, Need, Ns, Params
 DEVICES: Final = 32
 LOAD: Final = 0.35
 NAMING: Final = 85
-"""Of 100 programs so many have a place of their own."""
+"""Of 100 programs, the number with a place of their own."""
 MOST_BY_PATTERN: Final = 4
 PERSONNEL: Final = 2
 """The group of system personnel in the NASA iPSC log."""
@@ -30,7 +29,7 @@ HIGHER: Final = 5
 
 
 class _Line(NamedTuple):
-    """A line of the trace: seconds, nodes, and whose it is."""
+    """A line of the trace: seconds, nodes, and its owner."""
 
     submitted: int
     runtime: int
@@ -42,7 +41,7 @@ class _Line(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """`mask`: the devices that it names, by bit; 0: any `width`."""
+    """`mask`: the devices that it names, by bit; 0: any `width` devices."""
 
     at: Ns
     runtime: Ns
@@ -54,8 +53,8 @@ class Job:
 
 
 def read_trace(path: Path, first: int | None = None, places: int = 0) -> list[Job]:
-    """The jobs of a trace (.swf or .swf.gz) in order of arrival, or the `first` of them; `places`: which of many random
-    places programs have. Raises BadInput."""
+    """The jobs of a trace (.swf or .swf.gz) in order of arrival, or the `first` of them. `places` selects another
+    random assignment of places to programs. Raises BadInput."""
     try:
         raw = path.read_bytes()
         text = (gzip.decompress(raw) if path.suffix == ".gz" else raw).decode("latin-1")
@@ -82,7 +81,7 @@ def parse_trace(lines: Iterable[str], source: str, places: int = 0) -> list[Job]
             fields = [round(float(word)) for word in text.split()]
             job = _Line(fields[1], fields[3], max(fields[4], fields[7]), fields[11], fields[12], fields[13])
         except (ValueError, IndexError):
-            raise BadInput(f"{source}: line {number} is no job; write 18 numbers") from None
+            raise BadInput(f"{source}: line {number} is not a job; write 18 numbers") from None
         if job.runtime > 0 and job.nodes > 0:
             found.append(job)
     machine = machine or max((job.nodes for job in found), default=1)
@@ -119,7 +118,7 @@ def load(jobs: Iterable[Job]) -> float:
 
 
 def workload(jobs: Iterable[Job], *, classes: bool) -> Workload:
-    """The jobs as requests of their users; with `classes` those of system personnel have a higher priority."""
+    """The jobs as requests of their users. With `classes`, jobs of system personnel have a higher priority."""
     names = [f"node/n{number:02}" for number in range(DEVICES)]
     arrivals = []
     for number, job in enumerate(jobs):

@@ -1,4 +1,4 @@
-"""What `python -m studies schedule` prints for people."""
+"""Tables of `python -m studies schedule`, `bookings` and `shares`."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def print_report(report: SchedulingReport) -> None:
         print_table(
             ["feature", "correlation"],
             [[name, "-" if value is None else f"{value:+.2f}"] for name, value in ordered],
-            title="What foretells that priority is behind",
+            title="Features that predict that priority is behind",
         )
         print_line("")
     if report.rule is not None:
@@ -33,7 +33,7 @@ def print_report(report: SchedulingReport) -> None:
         print_line(f"Rule: priority is behind where {rule}")
         print_line(
             f"On {rule.situations} situations of other seeds it is right in {rule.hit_rate:.1%} "
-            f'(always saying "never", or "always": {rule.base_rate:.1%}). It names {rule.named:.1%} of them, '
+            f'(always answering "never", or "always": {rule.base_rate:.1%}). It names {rule.named:.1%} of them, '
             f"{rule.precision:.1%} of these rightly, and finds {rule.found:.1%} of those behind."
         )
 
@@ -43,20 +43,20 @@ def print_bookings(report: BookingsReport) -> None:
     for family, rows in report.families.items():
         shown = [
             [
-                f"{one.share:.0%}",
-                f"{one.booked:.1f}",
-                f"{one.in_use:.1%}",
-                f"{one.lost:.1%}",
-                f"{one.thrown_away:.1%}",
+                f"{row.share:.0%}",
+                f"{row.booked:.1f}",
+                f"{row.in_use:.1%}",
+                f"{row.lost:.1%}",
+                f"{row.thrown_away:.1%}",
                 *(
-                    (f"{one.at_date:.1%}", f"{one.moved:.1f} s", f"{one.at_once:.1%}")
-                    if one.booked
+                    (f"{row.at_date:.1%}", f"{row.moved:.1f} s", f"{row.at_once:.1%}")
+                    if row.booked
                     else ("-", "-", "-")
                 ),
-                f"{one.wait:.1f} s",
-                f"{one.longest:.0f} s",
+                f"{row.wait:.1f} s",
+                f"{row.longest:.0f} s",
             ]
-            for one in rows
+            for row in rows
         ]
         print_table([*columns, "mean wait", "longest"], shown, title=f"{family}: {FAMILIES[family].summary}")
         print_line("")
@@ -76,14 +76,14 @@ def print_shares(report: SharesReport) -> None:
     print_line("")
     columns = ["a group", "cases", "rose", "beyond", "fell", "mean", "most", "without: rose", "beyond", "fell", "mean"]
     ways = [
-        [one.way, str(one.cases), *_changed(one.on), f"{one.on.greatest:+.0%} (seed {one.on.seed})", *_changed(one.off)]
-        for one in report.ways
+        [way.way, str(way.cases), *_changed(way.on), f"{way.on.greatest:+.0%} (seed {way.on.seed})", *_changed(way.off)]
+        for way in report.ways
     ]
-    print_table(columns, ways, title=f"Its part of all that is of use: cases in which that changed by over {RISE:.0%}")
+    print_table(columns, ways, title=f"Its part of all useful RC-seconds: cases in which it changed by over {RISE:.0%}")
 
 
-def _changed(one: Changes) -> list[str]:
-    return [f"{one.rose:.1%}", f"{one.beyond:.1%}", f"{one.fell:.1%}", f"{one.mean:+.1%}"]
+def _changed(changes: Changes) -> list[str]:
+    return [f"{changes.rose:.1%}", f"{changes.beyond:.1%}", f"{changes.fell:.1%}", f"{changes.mean:+.1%}"]
 
 
 def _family(family: FamilyReport) -> None:
@@ -91,26 +91,28 @@ def _family(family: FamilyReport) -> None:
     columns = ["strategy", "in use", "mean wait", "p99", "longest", "preempted", "thrown away"]
     columns += ["last end", "pass", "p99"] + (["at first", "first pass", "p99"] if together else [])
     seeds = f"{family.family}: {family.summary}"
-    print_table(columns, [_strategy(one, together) for one in family.strategies], title=seeds)
+    print_table(columns, [_strategy(strategy, together) for strategy in family.strategies], title=seeds)
     print_line("")
 
 
-def _strategy(one: StrategyReport, together: bool) -> list[str]:
-    took = one.decision_us
+def _strategy(strategy: StrategyReport, together: bool) -> list[str]:
+    took = strategy.decision_us
     cells = [
-        one.strategy,
-        f"{one.in_use:.1%}",
-        f"{one.wait_mean:.1f} s",
-        f"{one.wait_p99:.0f} s",
-        f"{one.wait_longest:.0f} s",
-        f"{one.preemptions:.1f}",
-        f"{one.thrown_away:.1%}",
-        f"{one.end:.0f} s",
+        strategy.strategy,
+        f"{strategy.in_use:.1%}",
+        f"{strategy.wait_mean:.1f} s",
+        f"{strategy.wait_p99:.0f} s",
+        f"{strategy.wait_longest:.0f} s",
+        f"{strategy.preemptions:.1f}",
+        f"{strategy.thrown_away:.1%}",
+        f"{strategy.end:.0f} s",
         f"{took.median:.0f} us",
         f"{took.p99:.0f} us",
     ]
     return (
-        [*cells, f"{one.first:.1%}", f"{took.first_median:.0f} us", f"{took.first_p99:.0f} us"] if together else cells
+        [*cells, f"{strategy.first:.1%}", f"{took.first_median:.0f} us", f"{took.first_p99:.0f} us"]
+        if together
+        else cells
     )
 
 

@@ -1,4 +1,4 @@
-"""A job trace under the strategies of the product, beside batch schedulers: waits, and what preemption throws away."""
+"""A job trace under zscout's strategies, compared with batch schedulers: waits, and work thrown away by preemption."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ BASELINE = "EASY"
 class TraceTrial(NamedTuple):
     path: Path
     policy: str
-    """A strategy of the product, or one of `POLICIES`."""
+    """A strategy of zscout, or a name in `POLICIES`."""
     classes: bool
     first: int | None = None
     places: int = 0
@@ -34,7 +34,7 @@ class TraceTrial(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class TraceReport:
-    """Waits in seconds. `higher`: the mean of the higher class; `thrown_away`: share of the device time that was held;
+    """Waits in seconds. `higher`: mean wait of the higher class; `thrown_away`: as a share of the held device time;
     `event_us`: processor time per event of the core, in microseconds."""
 
     policy: str
@@ -79,21 +79,21 @@ def _report(trial: TraceTrial, jobs: Sequence[Job], waits: Sequence[Ns], *rest: 
 
 
 def rows(reports: Sequence[TraceReport]) -> list[list[str]]:
-    """One line for each, waits in ratios to EASY."""
-    base = next((one for one in reports if one.policy == BASELINE), None)
+    """One line for each report, with waits as ratios to EASY."""
+    base = next((report for report in reports if report.policy == BASELINE), None)
     found = []
-    for one in sorted(reports, key=lambda one: one.classes):
-        first = base is None or one is base
+    for report in sorted(reports, key=lambda report: report.classes):
+        first = base is None or report is base
         found.append(
             [
-                one.policy,
-                "two" if one.classes else "one",
-                f"{one.mean:,.0f} s" if base is None or first else f"{one.mean / base.mean:.2f}",
-                f"{one.longest:,.0f} s" if base is None or first else f"{one.longest / base.longest:.2f}",
-                f"{one.higher:,.0f} s" if base is None or first else f"{one.higher / base.higher:.2f}",
-                f"{one.thrown_away:.1%}",
-                str(one.preemptions),
-                "" if one.event_us is None else f"{one.event_us:,.0f} us",
+                report.policy,
+                "two" if report.classes else "one",
+                f"{report.mean:,.0f} s" if base is None or first else f"{report.mean / base.mean:.2f}",
+                f"{report.longest:,.0f} s" if base is None or first else f"{report.longest / base.longest:.2f}",
+                f"{report.higher:,.0f} s" if base is None or first else f"{report.higher / base.higher:.2f}",
+                f"{report.thrown_away:.1%}",
+                str(report.preemptions),
+                "" if report.event_us is None else f"{report.event_us:,.0f} us",
             ]
         )
     return found

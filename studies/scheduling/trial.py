@@ -19,7 +19,7 @@ from zscout.types import Ns
 STRATEGIES: Final[Mapping[str, Callable[[], Strategy]]] = {
     str(name): make for name, make in strategies.STRATEGIES.items()
 }
-"""Each makes a strategy for one run."""
+"""Factories of strategies; each run has its own instance."""
 JUDGED = "priority"
 """The strategy whose situations are judged against the best: the paper's heuristic."""
 BEST = "optimal"
@@ -27,7 +27,7 @@ BEST = "optimal"
 
 @dataclass(frozen=True, slots=True, order=True)
 class SchedulingJob:
-    """What to run. `drawn` asks for the run's curve as well."""
+    """A run. `drawn`: return the run's curve as well."""
 
     family: str
     seed: int
@@ -42,7 +42,7 @@ class SchedulingTrial:
     situations: tuple[Situation, ...]
     """Empty unless the strategy is `JUDGED`."""
     decisions: tuple[Ns, ...]
-    """How long each pass took on the caller's clock: the only part that is not the same every time."""
+    """Duration of each pass on the caller's clock: the only part that differs from run to run."""
     curve: Curve | None = None
 
 
@@ -68,20 +68,20 @@ class _Watched:
 
 
 def run(job: SchedulingJob, clock: Callable[[], Ns]) -> SchedulingTrial:
-    """Runs a job to its end. `clock` gives ns and only serves to time the passes.
+    """Run a job to its end. `clock` gives ns, and only times the passes.
 
-    Raises KeyError for a family or strategy that does not exist."""
+    Raises KeyError for an unknown family or strategy."""
     return play(job, FAMILIES[job.family].workload(job.seed), clock)
 
 
 def run_timed(job: SchedulingJob) -> SchedulingTrial:
-    """The same with passes timed in processor time, as a study keeps all processors busy; of all threads,
-    since a solver may have some."""
+    """The same with passes timed in processor time, because a study keeps all processors busy; of all threads, because
+    a solver may have several."""
     return run(job, time.process_time_ns)
 
 
 def play(job: SchedulingJob, workload: Workload, clock: Callable[[], Ns]) -> SchedulingTrial:
-    """The same with a workload of the caller's own."""
+    """The same with the caller's workload."""
     observer = Observer(workload.rcs, STRATEGIES[BEST]()) if job.strategy == JUDGED else None
     watched = _Watched(STRATEGIES[job.strategy](), clock, observer)
     played = replay(workload, strategy=watched)

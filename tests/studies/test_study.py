@@ -93,7 +93,7 @@ def test_the_list_names_each_study_as_the_page_does(capsys: pytest.CaptureFixtur
 def test_at_a_terminal_a_bar_shows_how_far_it_is() -> None:
     with Terminal("schedule", "--family", "paper", "--seeds", "3", command=STUDIES) as terminal:
         terminal.until(f"/{3 * len(STRATEGIES)}")
-        terminal.until("What foretells")
+        terminal.until("Features that predict")
         assert terminal.code() == 0
 
 

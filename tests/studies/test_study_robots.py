@@ -78,5 +78,5 @@ def test_starts_in_a_building_without_a_robot_are_one_line_and_code_2(
     empty = tmp_path / "empty.toml"
     empty.write_text('name = "empty"\nwidth = 4\ndepth = 4\n[[light]]\nname = "lamp"\nx = 2\ny = 2\n')
     assert study_here("robots", "--starts", "1", "--jobs", "1", "--building", empty) == 2
-    line = f"studies: --building {empty}: there is no robot in it to start; add a [[robot]]\n"
+    line = f"studies: --building {empty}: it has no robot to start; add a [[robot]]\n"
     assert capsys.readouterr() == ("", line)

@@ -45,7 +45,7 @@ def test_the_nodes_of_a_trace_become_devices() -> None:
 
 
 def test_a_line_that_is_no_job_is_told() -> None:
-    with pytest.raises(BadInput, match="line 2 is no job"):
+    with pytest.raises(BadInput, match="line 2 is not a job"):
         parse_trace([line(1, 0, 1, 1), "1 2 three"], "trace")
 
 
