@@ -152,7 +152,7 @@ component logs counter --lines -1 | --lines: -1 is out of range; write 0 to 1000
 component migrate counter --to a/b | --to "a/b" is not valid; use 1 to 64 of A-Z a-z 0-9 _ . -
 drain * | host "*" is not valid; use 1 to 64 of A-Z a-z 0-9 _ . -
 uncordon '' | host "" is not valid; use 1 to 64 of A-Z a-z 0-9 _ . -
-components --kinds --watch | --kinds lists what can be started; leave NAME and --watch out
+components --kinds --watch | --kinds takes no NAME and no --watch; leave them out
 component list 'a b' | component "a b" is not valid; use 1 to 64 of A-Z a-z 0-9 _ . -; see zscout component list
 doctor --keys --all --json | there is no option --all (see zscout doctor --help)
 cert ca --days 0 | --days: "0" is not a time up to 36,525 days; write it as in 90, 12h, 90s
@@ -202,11 +202,11 @@ node --nope | there is no option --nope (see zscout node --help)
 LONG: Final = {
     f"component start {'k' * 49}": "has more than 48 characters; give a shorter --name",
     "component start counter"
-    + "".join(f" --label=l{number}" for number in range(33)): "33 labels; give --label at most 32 times",
+    + "".join(f" --label=l{number}" for number in range(33)): "33 labels are too many; give --label at most 32 times",
     "component start counter"
     + "".join(
         f" --host=h{number}" for number in range(257)
-    ): "257 hosts; give --host at most 256 times, or give them a label and use --label",
+    ): "257 hosts are too many; give --host at most 256 times, or use --label",
     f"booking cancel {'x' * 65}": """x..." can't be the name of a booking; see zscout booking list""",
     f"why {'x' * 300}": """x..." can't be the name of a request; see zscout status""",
 }

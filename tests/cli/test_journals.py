@@ -37,8 +37,8 @@ def test_yesterday_is_the_midnight_before_today() -> None:
 
 def test_an_end_in_words() -> None:
     by = ReasonParty("i", "take", "desk/two", 10, Who("bob"))
-    assert journals.ending(past(1, 10.0)) == "stands"
-    assert journals.ending(past(1, 10.0, 20.0, UNHEARD)) == "end not heard"
+    assert journals.ending(past(1, 10.0)) == "in force"
+    assert journals.ending(past(1, 10.0, 20.0, UNHEARD)) == "end not seen"
     assert journals.ending(past(1, 10.0, 20.0, "preempted", by=by)) == "preempted by take of bob"
     nameless = ReasonParty("i", "take", "desk/two", 10, Who())
     assert journals.ending(past(1, 10.0, 20.0, "preempted", by=nameless)) == "preempted by take of desk"

@@ -1,4 +1,4 @@
-"""Bookings that the RCM told of: whose they are, which is meant by a name, and how they are shown."""
+"""Bookings as the RCM lists them: their owners, the search by name or id, and their words."""
 
 from __future__ import annotations
 
@@ -26,19 +26,17 @@ from zscout.terminal import clean, clock, span
 SHOWN_ID: Final = 8
 """Characters of an id that are shown."""
 MIN_PREFIX: Final = 4
-"""An id is also named by its beginning, of so many characters at least."""
-SOON: Final = 86_400
-"""Seconds."""
+"""Shortest beginning of an id that names its booking, in characters."""
+SOON_S: Final = 86_400
 MAX_LISTED: Final = 8
 MAX_TEXT: Final = 64
-CLOCKS_DIFFER: Final = 2.0
-"""Seconds."""
-BAD: Final = frozenset({"bad_date", "bad_zone", "bad_request"})
-"""What the RCM refuses that is to be written in another way."""
+MAX_CLOCK_DIFFERENCE_S: Final = 2.0
+BAD_INPUT_CODES: Final = frozenset({"bad_date", "bad_zone", "bad_request"})
+"""Codes of refusals that another input would avoid."""
 
 
 def parse_booking(text: str, option: str) -> str:
-    """What may be a booking's name or id. Raises BadInput."""
+    """Check a booking's name or id. Raises BadInput."""
     if not 1 <= len(text) <= MAX_TEXT or not text.isprintable():
         raise BadInput(f"{option}: {quoted(text)} can't be the name of a booking; see zscout booking list")
     return text
@@ -56,82 +54,83 @@ def zone_option(command: F) -> F:
 
 
 async def ask_bookings(client: Client, rc: str | None = None) -> BookingsTold:
-    """All that are not over. Says on stderr where this host's clock is not the fleet's. Raises RequestRefused."""
-    told = await BookingsClient(client).list(rc=rc)
-    differs = time.time() - told.time
-    if abs(differs) > CLOCKS_DIFFER:
+    """Return all bookings that are not over. Warns on stderr if this host's clock differs from fleet time. Raises
+    RequestRefused."""
+    answer = await BookingsClient(client).list(rc=rc)
+    differs = time.time() - answer.time
+    if abs(differs) > MAX_CLOCK_DIFFERENCE_S:
         click.secho(f"this host's clock is {differs_words(differs)}; dates are by the fleet's", fg="yellow", err=True)
-    return told
+    return answer
 
 
 async def look(client: Client) -> BookingsTold | None:
-    """The same at a glance; None: nobody told them."""
+    """Return all bookings that are not over after one query; None: no answer."""
     reply = await client.mesh.ask_one(
         client.mesh.keys.ask_bookings(client.mesh.me), BookingsAsk(), BookingsTold, timeout=QUERY_TIMEOUT
     )
     return reply.message if reply is not None else None
 
 
-def soon(told: BookingsTold | None) -> int:
+def soon(answer: BookingsTold | None) -> int:
     return (
         0
-        if told is None
+        if answer is None
         else sum(
-            one.state in ("open", "taken") and told.time <= one.start < told.time + SOON
-            for booking in told.bookings
-            for one in booking.dates
+            date.state in ("open", "taken") and answer.time <= date.start < answer.time + SOON_S
+            for booking in answer.bookings
+            for date in booking.dates
         )
     )
 
 
-def in_maintenance(told: BookingsTold | None) -> dict[str, str]:
-    """Whose maintenance each RC is in now, and until when: `greased (ada@desk) until 14:30`."""
+def in_maintenance(answer: BookingsTold | None) -> dict[str, str]:
+    """Return the current maintenance by RC: `greased (ada@desk) until 14:30`."""
     return {
-        rc: clean(f"{booking.name} ({whose(booking)}) until {_end(booking, date, told)}")
-        for booking in (told.bookings if told is not None else ())
+        rc: clean(f"{booking.name} ({whose(booking)}) until {_end(booking, date, answer)}")
+        for booking in (answer.bookings if answer is not None else ())
         for date in booking.dates
-        if told is not None and booking.maintenance and not booking.broken and date.start <= told.time < date.end
+        if answer is not None and booking.maintenance and not booking.broken and date.start <= answer.time < date.end
         for rc in booking.maintained or booking.needs
     }
 
 
-def broken(told: BookingsTold | None) -> dict[str, str]:
-    """Why each broken RC is, and who has said so: `its gripper is bent (ada@desk)`."""
-    return {rc: _why_broken(booking) for booking in reports(told) for rc in booking.maintained or booking.needs}
+def broken(answer: BookingsTold | None) -> dict[str, str]:
+    """Return the reason and the reporter by broken RC: `its gripper is bent (ada@desk)`."""
+    return {rc: _why_broken(booking) for booking in reports(answer) for rc in booking.maintained or booking.needs}
 
 
-def reports(told: BookingsTold | None) -> list[BookingView]:
-    """The reports of broken devices that are in force."""
-    found = told.bookings if told is not None else []
+def reports(answer: BookingsTold | None) -> list[BookingView]:
+    """Return the reports of broken devices that are in force."""
+    found = answer.bookings if answer is not None else []
     return [booking for booking in found if booking.broken and not booking.unbooked]
 
 
 def _why_broken(booking: BookingView) -> str:
-    said = booking.who.comment if booking.who is not None else ""
-    return clean(f"{said or booking.name} ({whose(booking)})")
+    comment = booking.who.comment if booking.who is not None else ""
+    return clean(f"{comment or booking.name} ({whose(booking)})")
 
 
-def _end(booking: BookingView, date: BookedDate, told: BookingsTold) -> str:
-    return "cancelled" if booking.lasting else clock(date.end - told.time)
+def _end(booking: BookingView, date: BookedDate, answer: BookingsTold) -> str:
+    return "cancelled" if booking.lasting else clock(date.end - answer.time)
 
 
-def maintenance_of(told: BookingsTold, host: str) -> list[tuple[BookingView, BookedDate]]:
-    """The maintenance of all devices of a host that lasts now."""
+def maintenance_of(answer: BookingsTold, host: str) -> list[tuple[BookingView, BookedDate]]:
+    """Return the current maintenance of all devices of a host."""
     return [
         (booking, date)
-        for booking in told.bookings
+        for booking in answer.bookings
         for date in booking.dates
-        if booking.maintenance and of_host(host) in booking.needs and date.start <= told.time < date.end
+        if booking.maintenance and of_host(host) in booking.needs and date.start <= answer.time < date.end
     ]
 
 
-def coming(told: BookingsTold | None) -> dict[str, str]:
-    """The next booking of each RC within 24 h, and when it begins: `calib (ada@desk) from 14:30`."""
+def coming(answer: BookingsTold | None) -> dict[str, str]:
+    """Return the next booking within 24 h by RC: `calib (ada@desk) from 14:30`."""
     found = [
-        (date.start, rc, clean(f"{booking.name} ({whose(booking)}) from {clock(date.start - told.time)}"))
-        for booking in (told.bookings if told is not None else ())
+        (date.start, rc, clean(f"{booking.name} ({whose(booking)}) from {clock(date.start - answer.time)}"))
+        for booking in (answer.bookings if answer is not None else ())
         for date in booking.dates
-        if told is not None and date.state == "open" and 0 < date.start - told.time < SOON
+        if answer is not None and date.state == "open" and 0 < date.start - answer.time < SOON_S
         for rc in (date.bound.get(need, need) for need in booking.needs)
     ]
     return {rc: words for _, rc, words in sorted(found, reverse=True)}
@@ -155,17 +154,17 @@ class NextDate(NamedTuple):
         return clean(f"{self.rc} is {what} by {self.owner} ({self.booking}) {begins} {ends}")
 
 
-def next_dates(told: BookingsTold | None, needs: Iterable[str], own: str = "") -> list[NextDate]:
-    """The next date of each device that these needs mean, without that which the request `own` (`<host>/<client>/<id>`)
-    has taken up; the earliest first."""
+def next_dates(answer: BookingsTold | None, needs: Iterable[str], own: str = "") -> list[NextDate]:
+    """Return the next date of each device that meets `needs`, earliest first, without the dates that the request `own`
+    (`<host>/<client>/<id>`) has taken up."""
     meets, found = [matcher(need) for need in needs], dict[str, NextDate]()
-    if told is None:
+    if answer is None:
         return []
-    for booking in told.bookings:
+    for booking in answer.bookings:
         for date in booking.dates if not booking.broken else ():
-            if date.state not in ("open", "taken") or date.end <= told.time or (own and date.arc == own):
+            if date.state not in ("open", "taken") or date.end <= answer.time or (own and date.arc == own):
                 continue
-            begins, ends = date.start - told.time, None if booking.lasting else date.end - told.time
+            begins, ends = date.start - answer.time, None if booking.lasting else date.end - answer.time
             rcs = booking.maintained or [date.bound.get(need, need) for need in booking.needs]
             for rc in rcs:
                 later = rc in found and found[rc].begins_in <= begins
@@ -175,8 +174,8 @@ def next_dates(told: BookingsTold | None, needs: Iterable[str], own: str = "") -
 
 
 def explained(refused: RequestRefused) -> Exception:
-    """What to raise instead: bad input has its own exit code."""
-    return BadInput(str(refused)) if refused.code in BAD else refused
+    """Return the exception to raise: BadInput, with its own exit code, if another input would avoid the refusal."""
+    return BadInput(str(refused)) if refused.code in BAD_INPUT_CODES else refused
 
 
 # Which booking is meant
@@ -192,8 +191,8 @@ def label(booking: BookingView) -> str:
 
 
 def choose(bookings: Sequence[BookingView], name: str, user: User) -> BookingView:
-    """The user's own booking of this name, else the booking with this id, else another user's of this name, else the
-    booking whose id begins with it. Raises Failed if there is none, or more than one."""
+    """Find the booking that `name` means: the user's own of this name, else the booking with this id, else another
+    user's of this name, else the booking whose id begins with `name`. Raises Failed for none, or several."""
     there = [booking for booking in bookings if not booking.unbooked]
     alike = [booking for booking in there if booking.name == name]
     found = [booking for booking in alike if is_own(booking, user)]
@@ -201,9 +200,9 @@ def choose(bookings: Sequence[BookingView], name: str, user: User) -> BookingVie
     if not found and len(name) >= MIN_PREFIX:
         found = [booking for booking in there if booking.id.startswith(name)]
     if not found:
-        raise common.unknown("booking", name, [one.name for one in there], "and there are none", "booked")
+        raise common.unknown("booking", name, [booking.name for booking in there], "and there are none", "booked")
     if len(found) > 1:
-        listed = "; ".join(f"{short(one)} {_next(one)} of {whose(one)}" for one in found[:MAX_LISTED])
+        listed = "; ".join(f"{short(booking)} {_next(booking)} of {whose(booking)}" for booking in found[:MAX_LISTED])
         more = f" and {len(found) - MAX_LISTED} more" if len(found) > MAX_LISTED else ""
         raise Failed(clean(f"{len(found)} bookings are called {quoted(name)}: {listed}{more}; name one by its id"))
     return found[0]
@@ -211,7 +210,7 @@ def choose(bookings: Sequence[BookingView], name: str, user: User) -> BookingVie
 
 def free_name(wanted: str, own: Sequence[BookingView]) -> str:
     """`arm1`, or if the user has a booking of that name, `arm1-2`."""
-    taken = {one.name for one in own}
+    taken = {booking.name for booking in own}
     numbered = (f"{wanted}-{number}" for number in range(2, len(taken) + 3))
     return wanted if wanted not in taken else next(name for name in numbered if name not in taken)
 
@@ -224,7 +223,7 @@ def short(booking: BookingView) -> str:
 
 
 def whose(booking: BookingView) -> str:
-    """`alice@ws1`; the host or certificate that made it, if its user is unknown."""
+    """`alice@ws1`; if the user is unknown, the host or certificate that made the booking."""
     return ownership.whose(booking.owner, booking.who)
 
 
@@ -236,7 +235,7 @@ def rcs_words(booking: BookingView, date: BookedDate | None = None) -> str:
 
 
 def when_words(booking: BookingView, date: BookedDate, zone: ZoneInfo | None) -> str:
-    """`Tue 2026-12-01 14:00 to 16:00`, or until it is cancelled."""
+    """`Tue 2026-12-01 14:00 to 16:00`, `Tue 2026-12-01 14:00 until cancelled`."""
     if booking.lasting:
         return f"{date_words(date.start, zone)} until cancelled"
     return span_words(date.start, date.end, zone)
@@ -272,7 +271,7 @@ def corrected_words(corrected: Correction) -> str:
 
 
 def differs_words(differs: float) -> str:
-    """By how many seconds a clock is ahead, in words."""
+    """Words for a clock that is `differs` seconds ahead of the fleet's."""
     return f"{span(abs(differs))} {'ahead of' if differs > 0 else 'behind'} the fleet's"
 
 
@@ -281,8 +280,8 @@ def utc(at: float) -> str:
 
 
 def booking_json(booking: BookingView, user: User) -> dict[str, Any]:
-    """As `--json` prints it: instants in UTC, spans in seconds."""
-    dates = [structs.asdict(one) | {"start": utc(one.start), "end": utc(one.end)} for one in booking.dates]
+    """Return the object of `--json`: instants in UTC, durations in seconds."""
+    dates = [structs.asdict(date) | {"start": utc(date.start), "end": utc(date.end)} for date in booking.dates]
     until = None if booking.until is None else utc(booking.until)
     return structs.asdict(booking) | {
         "own": is_own(booking, user),

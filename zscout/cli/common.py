@@ -1,4 +1,4 @@
-"""What the subcommands share: running, joining the mesh, options.
+"""Shared by the subcommands: running, joining the mesh, options.
 
 Zenoh and Rich are imported by the functions that need them: most of a short command's time is imports.
 """
@@ -28,13 +28,13 @@ if TYPE_CHECKING:
     from zscout.behaviors.client.client import Client
     from zscout.mesh import Mesh, Reply
 
-LOOK_FOR_RCM: Final = 2.0
-"""Seconds in which a mesh that has an RCM shows it."""
-LOOK_FOR_TAKEOVER: Final = 5.0
-"""The same where a candidate is seen: it may be about to take the lead."""
+FIND_RCM_S: Final = 2.0
+"""Within this time the token of an RCM is seen."""
+AWAIT_TAKEOVER_S: Final = 5.0
+"""The same if a candidate is seen: it may be about to take the lead."""
 STATE_TRIES: Final = 3
 MAX_NAMED: Final = 8
-"""Names that are listed of those known."""
+"""Known names that an error lists."""
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -42,7 +42,7 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 
 class Failed(Exception):
-    """A command could not do what was asked: one line, with the remedy, and the exit code."""
+    """A command failed: one line, with the remedy, and the exit code."""
 
     exit_code = 1
 
@@ -58,7 +58,7 @@ class NobodyThere(Failed):
 
 
 class Interrupted(Exception):
-    """Ended by a signal, after everything was cleared up."""
+    """Ended by a signal, after cleaning up."""
 
     def __init__(self, number: int) -> None:
         super().__init__(signal.Signals(number).name)
@@ -69,20 +69,20 @@ class Interrupted(Exception):
 
 
 def run(main: Coroutine[Any, Any, T]) -> T:
-    """Runs a command's coroutine. SIGINT, SIGTERM and SIGHUP cancel it, so that it clears up; a second one
-    cancels the clearing up. Raises Interrupted then."""
-    got: list[int] = []
+    """Run a command's coroutine. SIGINT, SIGTERM and SIGHUP cancel it, so that it cleans up; a second signal cancels
+    the cleaning up. Raises Interrupted after a signal."""
+    signals: list[int] = []
 
     async def guarded() -> T:
         loop = asyncio.get_running_loop()
         task = asyncio.ensure_future(main)
 
         def stop(number: int) -> None:
-            got.append(number)
+            signals.append(number)
             task.cancel()
 
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-            # What a shell or nohup made this process ignore stays ignored.
+            # Signals that a shell or nohup made this process ignore stay ignored.
             if signal.getsignal(number) is not signal.SIG_IGN:
                 loop.add_signal_handler(number, stop, number)
         return await task
@@ -90,9 +90,9 @@ def run(main: Coroutine[Any, Any, T]) -> T:
     try:
         return asyncio.run(guarded())
     except asyncio.CancelledError:
-        if not got:
+        if not signals:
             raise
-        raise Interrupted(got[0]) from None
+        raise Interrupted(signals[0]) from None
 
 
 def runs(main: Callable[P, Coroutine[Any, Any, T]]) -> Callable[P, T]:
@@ -108,28 +108,28 @@ def runs(main: Callable[P, Coroutine[Any, Any, T]]) -> Callable[P, T]:
 
 
 def _given_file() -> Path | None:
-    """What `--fleet` names, at Tab as well, where no command has run yet."""
+    """Return the file of `--fleet`; during completion as well, before any command runs."""
     context = click.get_current_context(silent=True)
     given = context.find_root().params.get("fleet") if context is not None else None
     return given if isinstance(given, Path) else None
 
 
 def fleet_file() -> Path | None:
-    """The fleet file: `--fleet`, else $ZSCOUT_FLEET; None: the default fleet."""
-    named = os.environ.get(FLEET_VARIABLE)
-    return _given_file() or (Path(named) if named else None)
+    """Return the fleet file: `--fleet`, else $ZSCOUT_FLEET; None: the default fleet."""
+    variable = os.environ.get(FLEET_VARIABLE)
+    return _given_file() or (Path(variable) if variable else None)
 
 
 def the_fleet() -> Fleet:
-    """The fleet that this call of zscout is about. Raises BadInput."""
+    """Load the fleet of this call of zscout. Raises BadInput."""
     given = _given_file()
     return load_fleet(given) if given is not None else fleet_from_env()
 
 
 @asynccontextmanager
 async def connected(role: str, fleet: Fleet | None = None, *, need_rcm: bool = True) -> AsyncIterator[Client]:
-    """A client named `<role>-<random>` on the mesh of `fleet` (default: `the_fleet()`), closed at the end. Raises
-    MeshError, BadInput, and with `need_rcm` NobodyThere where no RCM is seen in time."""
+    """Yield a client named `<role>-<random>` on the mesh of `fleet` (default: `the_fleet()`), and close it. Raises
+    MeshError, BadInput, and with `need_rcm` NobodyThere if no RCM is seen in time."""
     from zscout.behaviors.client.client import Client
 
     async with await Client.connect(f"{role}-{new_instance()}", fleet=fleet or the_fleet()) as client:
@@ -139,19 +139,19 @@ async def connected(role: str, fleet: Fleet | None = None, *, need_rcm: bool = T
         yield client
 
 
-async def see_rcm(client: Client, seconds: float = LOOK_FOR_RCM) -> None:
-    """Returns as soon as an RCM is seen. Raises NobodyThere where none is within `seconds`, or longer where one may be
-    about to lead."""
+async def see_rcm(client: Client, seconds: float = FIND_RCM_S) -> None:
+    """Return as soon as an RCM is seen. Raises NobodyThere after `seconds` without an RCM, or after a longer time if a
+    candidate may be about to lead."""
     from zscout.behaviors.client.client import NoRcm
 
     try:
-        await client.see_rcm(seconds, LOOK_FOR_TAKEOVER)
+        await client.see_rcm(seconds, AWAIT_TAKEOVER_S)
     except NoRcm as nobody:
         raise NobodyThere(str(nobody).replace(f"(${FLEET_VARIABLE})", f"(--fleet, ${FLEET_VARIABLE})")) from None
 
 
 async def state_of(client: Client, arc: str | None = None, *, forecast: bool = False) -> RcmState:
-    """The RCM's state, with the story of `arc`. Raises NobodyThere where no RCM answers."""
+    """Return the RCM's state, with the explanation of `arc`. Raises NobodyThere if no RCM answers."""
     for _ in range(STATE_TRIES):
         state = await client.state(arc, forecast=forecast)
         if state is not None:
@@ -160,8 +160,8 @@ async def state_of(client: Client, arc: str | None = None, *, forecast: bool = F
 
 
 async def ask_nodes(mesh: Mesh, message: Message, kind: type[T], timeout: float) -> list[Reply[T]]:
-    """The answers of all nodes to a question about components. On a secured fleet each is asked by itself: nobody may
-    answer with the key of a question to all."""
+    """Return the answers of all nodes to a question about components. A secured fleet lets no node answer on the shared
+    key, so each node is asked on its own key."""
     keys = mesh.keys
     if not keys.closed:
         return await mesh.ask(keys.component_any(mesh.me), message, kind, timeout=timeout)
@@ -171,7 +171,7 @@ async def ask_nodes(mesh: Mesh, message: Message, kind: type[T], timeout: float)
 
 
 async def until(true: Callable[[], bool], changed: asyncio.Event, seconds: float) -> bool:
-    """Waits until `true()`, looked at whenever something has `changed`, at most so long; returns which."""
+    """Wait at most `seconds` until `true()` holds, checked after each `changed`; return its last value."""
     with suppress(TimeoutError):
         async with asyncio.timeout(seconds):
             while not true():
@@ -191,7 +191,8 @@ async def beside(work: Coroutine[Any, Any, Any]) -> AsyncIterator[None]:
 
 
 async def first_of(*works: Coroutine[Any, Any, Any]) -> list[bool]:
-    """Runs all until one has ended, and cancels the others. Returns which have; raises what one raised."""
+    """Run `works` until the first ends, and cancel the others. Return for each whether it had ended; raise its
+    exception if it had one."""
     tasks = [asyncio.ensure_future(work) for work in works]
     try:
         done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
@@ -208,19 +209,19 @@ async def first_of(*works: Coroutine[Any, Any, Any]) -> list[bool]:
 
 
 def unknown(what: str, name: str, known: Iterable[str], nothing: str, listed: str, more: int = 0) -> Failed:
-    """What to raise where nobody knows a `name`: it lists names like it, or those that are known (the word is
-    `listed`) and how many `more` there are, or it says that there is `nothing`."""
+    """Return the exception for an unknown `name`. Its line has similar names, else the known names after the word
+    `listed` and the number of `more`, else the words `nothing`."""
     return Failed(f"unknown {what} {quoted(name)}{hint_at(name, known, nothing, listed, more)}")
 
 
 def device_named(state: RcmState, name: str) -> str | None:
-    """The device of this name, or the only device that may be meant by it: `robot/arm1` by `arm1`."""
+    """Return the device of this name, or the only device whose name ends in it: `robot/arm1` for `arm1`."""
     alike = [view.rc for view in state.rcs if name in (view.rc, view.rc.partition("/")[2])]
     return name if name in alike else alike[0] if len(alike) == 1 else None
 
 
 def hint_at(name: str, known: Iterable[str], nothing: str, listed: str, more: int = 0) -> str:
-    """The end of a line that says that nobody knows `name`: what was meant, perhaps."""
+    """Return the end of an error about an unknown `name`: similar or known names. Arguments as of `unknown`."""
     names = sorted(set(known))
     # `arm1` for `robot/arm1`.
     alike = [known for known in names if known.partition("/")[2] == name][:3]
@@ -233,7 +234,7 @@ def hint_at(name: str, known: Iterable[str], nothing: str, listed: str, more: in
 
 
 class Parsed(click.ParamType[T]):
-    """What `parse` makes of a text, given the option's name as well. It raises BadInput."""
+    """A parameter type from `parse`, which takes the text and the option's name and raises BadInput."""
 
     def __init__(self, name: str, parse: Callable[[str, str], T]) -> None:
         self.name, self._parse = name, parse
@@ -254,23 +255,23 @@ def json_option(help: str = "Print JSON.") -> Callable[[F], F]:  # noqa: A002 - 
 
 
 def with_amounts(name: str, params: Mapping[str, Decimal]) -> str:
-    """With bandwidth parameters as people write them: `radio/rf0 (command_rate=5,other=1)`."""
-    amounts = ",".join(f"{one}={value.normalize():f}" for one, value in sorted(params.items()))
+    """A need with its bandwidth parameters: `radio/rf0 (command_rate=5,other=1)`."""
+    amounts = ",".join(f"{param}={value.normalize():f}" for param, value in sorted(params.items()))
     return f"{name} ({amounts})" if amounts else name
 
 
 def check_recording(option: str, path: Path | None) -> None:
-    """That a recording can be written there, before anything is done for it. Raises BadInput."""
+    """Check that a recording can be written to `path`. Raises BadInput."""
     if path is None:
         return
     if path.suffix != ".rrd":
         raise BadInput(f"{option} {path}: not the name of a recording; end it in .rrd")
-    there = path.exists()
+    existed = path.exists()
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.open("ab").close()
     except OSError as error:
         why = "its folder is a file" if isinstance(error, FileExistsError) else error.strerror
         raise BadInput(f"{option} {path}: can't be written ({why}); give another file") from None
-    if not there:
+    if not existed:
         path.unlink()

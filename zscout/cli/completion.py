@@ -1,7 +1,7 @@
-"""What the shell offers at Tab: RCs, ARCs, bookings, hosts, components and kinds of the fleet as it is
-then; and `zscout completion`, the script that makes it do so.
+"""Completion of names that the fleet has when Tab is pressed: RCs, ARCs, bookings, hosts, components, kinds; and
+`zscout completion`, which prints the script for a shell.
 
-Without a fleet nothing is offered, and nothing said."""
+Without a fleet, completion offers nothing and prints no error."""
 
 from __future__ import annotations
 
@@ -19,22 +19,25 @@ if TYPE_CHECKING:
     from zscout.mesh import Mesh
     from zscout.messages import RcmState
 
-LOOK: Final = 1.0
-"""Seconds in which a mesh that was just joined shows who is there."""
-BOUND: Final = 2.0
-"""Seconds that Tab may take in all."""
+FIND_S: Final = 1.0
+"""Within this time peers of a mesh just joined are seen and answer."""
+MAX_DELAY_S: Final = 2.0
+"""Longest time between Tab and its answer."""
 PROGRAMS: Final = ("zscout", "zscout-node")
 SHELLS: Final = ("bash", "zsh", "fish")
 
 
 @click.command()
 @click.argument("shell", required=False, type=click.Choice(SHELLS))
-@click.option("--program", type=click.Choice(PROGRAMS), default=PROGRAMS[0], help="Whose arguments are completed.")
+@click.option(
+    "--program", type=click.Choice(PROGRAMS), default=PROGRAMS[0], help="Complete the arguments of this program."
+)
 @click.pass_context
 def completion(ctx: click.Context, shell: str | None, program: str) -> None:
     """Print the completion script for a shell; without SHELL, for the one in $SHELL.
 
-    At Tab it offers commands and options, and the current devices, requests, hosts, components and kinds of the fleet.
+    Tab then completes commands and options, and the names of the fleet's current devices, requests, bookings, hosts,
+    components and kinds.
 
     \b
     Examples:
@@ -55,19 +58,20 @@ Completer: TypeAlias = Callable[[click.Context, click.Parameter, str], list[str]
 
 
 def _on_mesh(find: Callable[[Mesh, str], Awaitable[Iterable[str]]]) -> Completer:
-    """Offers what `find(mesh, name of the parameter)` finds, but what is given; nothing without a mesh."""
+    """Return a completer that offers the names that `find(mesh, name of the parameter)` returns, without those already
+    written; none if the mesh can't be joined."""
 
-    def offered(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[str]:
+    def complete(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[str]:
         from zscout.cli import common
         from zscout.config.strict import BadInput
         from zscout.keyexpr import BadName
         from zscout.mesh import MeshError
 
         async def look() -> Iterable[str]:
-            async with asyncio.timeout(BOUND), common.connected("complete", need_rcm=False) as client:
-                # A mesh that was just joined shows nobody yet.
+            async with asyncio.timeout(MAX_DELAY_S), common.connected("complete", need_rcm=False) as client:
+                # On a mesh just joined no peers are visible yet.
                 with suppress(common.NobodyThere, TimeoutError):
-                    async with asyncio.timeout(LOOK):
+                    async with asyncio.timeout(FIND_S):
                         await common.see_rcm(client)
                 return await find(client.mesh, param.name or "")
 
@@ -80,15 +84,15 @@ def _on_mesh(find: Callable[[Mesh, str], Awaitable[Iterable[str]]]) -> Completer
         taken = given if isinstance(given, tuple) else ()
         return sorted({name for name in names if name.startswith(incomplete) and name not in taken})
 
-    return offered
+    return complete
 
 
 @_on_mesh
 async def components(mesh: Mesh, _parameter: str) -> Iterable[str]:
     from zscout.messages import ListPlacements, Placements
 
-    listed = await mesh.ask_one(mesh.keys.placer(mesh.me), ListPlacements(), Placements, timeout=LOOK)
-    return {one.component for one in listed.message.components} if listed and listed.message else ()
+    listed = await mesh.ask_one(mesh.keys.placer(mesh.me), ListPlacements(), Placements, timeout=FIND_S)
+    return {placement.component for placement in listed.message.components} if listed and listed.message else ()
 
 
 @_on_mesh
@@ -98,7 +102,7 @@ async def hosts(mesh: Mesh, _parameter: str) -> Iterable[str]:
 
 @_on_mesh
 async def rcs(mesh: Mesh, kind: str) -> Iterable[str]:
-    """Of the kind that the parameter is called by."""
+    """Names of RCs whose kind is the parameter's name."""
     return {name for name in await _rc_names(mesh) if name.startswith(f"{kind}/")}
 
 
@@ -121,16 +125,18 @@ async def arcs(mesh: Mesh, _parameter: str) -> Iterable[str]:
 
 @_on_mesh
 async def bookings(mesh: Mesh, _parameter: str) -> Iterable[str]:
-    """Names of bookings that are not over."""
+    """Names of bookings that are not over yet."""
     from zscout.messages import BookingsAsk, BookingsTold
 
-    reply = await mesh.ask_one(mesh.keys.ask_bookings(mesh.me), BookingsAsk(), BookingsTold, timeout=LOOK)
-    return {one.name for one in reply.message.bookings} if reply is not None and reply.message is not None else ()
+    reply = await mesh.ask_one(mesh.keys.ask_bookings(mesh.me), BookingsAsk(), BookingsTold, timeout=FIND_S)
+    return (
+        {booking.name for booking in reply.message.bookings} if reply is not None and reply.message is not None else ()
+    )
 
 
 @_on_mesh
 async def shown(mesh: Mesh, _parameter: str) -> Iterable[str]:
-    """Whatever has a name in `zscout status`."""
+    """All names that `zscout status NAME` takes."""
     found = await asyncio.gather(_rc_names(mesh), _named(mesh, "node"), _state(mesh))
     return {*found[0], *found[1], *_arc_names(found[2])}
 
@@ -140,12 +146,12 @@ async def _fleet_kinds(mesh: Mesh, _parameter: str) -> Iterable[str]:
     from zscout.cli import common
     from zscout.messages import ComponentList, ListComponents
 
-    replies = await common.ask_nodes(mesh, ListComponents(), ComponentList, LOOK)
+    replies = await common.ask_nodes(mesh, ListComponents(), ComponentList, FIND_S)
     return {kind for reply in replies if reply.message is not None for kind in reply.message.kinds or ()}
 
 
 def kinds(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[str]:
-    """Those that nodes can start; where none tells, those that are installed here."""
+    """Kinds that nodes can start; if no node answers, the kinds installed on this host."""
     if found := _fleet_kinds(ctx, param, incomplete):
         return found
     from zscout.behaviors.components.component import installed_kinds
@@ -154,17 +160,17 @@ def kinds(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[s
 
 
 async def _named(mesh: Mesh, role: str) -> set[str]:
-    return {token.host for token in await mesh.living(mesh.keys.alive_any(role), timeout=LOOK)}
+    return {token.host for token in await mesh.living(mesh.keys.alive_any(role), timeout=FIND_S)}
 
 
 async def _rc_names(mesh: Mesh) -> set[str]:
-    return {token.name for token in await mesh.living(mesh.keys.alive_any("rc"), timeout=LOOK)}
+    return {token.name for token in await mesh.living(mesh.keys.alive_any("rc"), timeout=FIND_S)}
 
 
 async def _state(mesh: Mesh) -> RcmState | None:
     from zscout.messages import RcmState, StateAsk
 
-    reply = await mesh.ask_one(mesh.keys.ask_state(mesh.me), StateAsk(), RcmState, timeout=LOOK)
+    reply = await mesh.ask_one(mesh.keys.ask_state(mesh.me), StateAsk(), RcmState, timeout=FIND_S)
     return reply.message if reply is not None else None
 
 

@@ -1,7 +1,7 @@
-"""Dates as people write them, in a zone: pure, but for where a host says what its zone is.
+"""Dates as people write them, in a time zone. Pure, except `host_zone`.
 
-A local time that comes twice, or never, as clocks are put back or forward, is taken as RFC 5545 (3.3.5) has it: the
-first of the two; or as if clocks had not been put forward yet. Who wrote it is told so."""
+When clocks are put back or forward, a local time may come twice or never. RFC 5545 (3.3.5) decides: the first of the
+two; or the time as if clocks had not been put forward yet. A note explains the choice to the user."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ DATE_FORMS: Final = (
 )
 EVERY_FORMS: Final = 'day, week, "2 weeks" or "10 days"'
 WEEKDAYS: Final = ("monday", "tuesday", "wednesday", "thursday", "friday", "saturday", "sunday")
-SOON: Final = 600.0
-"""Seconds from which on `in 2h` means a whole minute."""
+WHOLE_MINUTES_FROM_S: Final = 600.0
+"""Durations at least this long, as in `in 2h`, are rounded up to a whole minute."""
 YEARS: Final = range(1971, 9000)
-"""Those in which every time of every zone is one that a computer knows."""
+"""Years in which every time of every zone is a valid timestamp."""
 _TIME: Final = re.compile(r"(?P<hour>\d{1,2})(:(?P<minute>\d\d)(:(?P<second>\d\d))?)? ?(?P<half>am|pm)?", re.ASCII)
 _DAY: Final = re.compile(r"(?P<name>[a-z]{3,9})|(?P<date>\d{4}-\d\d-\d\d)", re.ASCII)
 _INSTANT: Final = re.compile(r"\d{4}-\d\d-\d\d[t ]\d\d:\d\d(:\d\d)?(?P<offset>z|[+-]\d\d:?\d\d)?", re.ASCII)
@@ -40,7 +40,7 @@ _WORDS: Final = {"daily": 1, "weekly": 7}
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """An instant, in its zone; `note` says what was taken where the local time comes twice, or never."""
+    """An instant in its zone; `note` explains the choice if the local time comes twice, or never."""
 
     at: datetime
     note: str = ""
@@ -49,26 +49,26 @@ class Found:
 
 @dataclass(frozen=True, slots=True)
 class WrittenDate:
-    """A date as it was written, before it is known when and in which zone that is."""
+    """A parsed date, before the current time and the zone are known."""
 
     text: str
     option: str
     after: float | None = None
     """Seconds from now."""
     day: date | int | str | None = None
-    """A date, a weekday (0: Monday), `today`, `tomorrow`; None: the next such time."""
+    """A date, a weekday (0: Monday), `today`, `tomorrow`; None: the next occurrence of `time`."""
     not_today: bool = False
-    """For a weekday: the first one after today."""
+    """A weekday is searched after today."""
     time: time | None = None
-    """None: a whole day is meant."""
+    """None: a whole day."""
     instant: datetime | None = None
 
     def found(self, now: float, zone: ZoneInfo) -> Found:
-        """When that is, `now` in seconds since 1970. Raises BadInput for a whole day."""
+        """Return the instant. `now`: seconds since 1970. Raises BadInput for a whole day."""
         if self.instant is not None:
             return Found(self.instant.astimezone(zone))
         if self.after is not None:
-            unit = 1 if self.after < SOON else 60
+            unit = 1 if self.after < WHOLE_MINUTES_FROM_S else 60
             return Found(datetime.fromtimestamp(math.ceil((now + self.after) / unit) * unit, zone))
         if self.time is None:
             raise BadInput(f"{self.option}: {quoted(self.text)} has no time; write {quoted(f'{self.text} 14:00')}")
@@ -80,13 +80,13 @@ class WrittenDate:
         return found
 
     def whole_day(self, now: float, zone: ZoneInfo) -> date | None:
-        """The day that is meant; None: a time is."""
+        """Return the day; None if the date has a time."""
         if self.instant is not None or self.after is not None or self.time is not None:
             return None
         return self._day(datetime.fromtimestamp(now, zone).date())
 
     def _day(self, today: date) -> date:
-        """A weekday is the next one, today included."""
+        """Return the day as a date. A weekday is the next, today included."""
         match self.day:
             case date():
                 return self.day
@@ -97,7 +97,7 @@ class WrittenDate:
 
 
 def parse_date(text: str, option: str) -> WrittenDate:
-    """What people write for a date. Raises BadInput."""
+    """Parse a date in one of DATE_FORMS. Raises BadInput."""
     words = " ".join(text.lower().split())
     bad = BadInput(f"{option}: {quoted(text)} is not a date; write {DATE_FORMS}")
     if words == "now":
@@ -146,7 +146,7 @@ def _named_day(name: str, bad: BadInput) -> int | str:
 
 
 def _time(text: str, bad: BadInput) -> time:
-    """`14:00`, `9:00`, `2pm`. Raises BadInput, ValueError."""
+    """Parse `14:00`, `9:00`, `2pm`. Raises BadInput, ValueError."""
     found = _TIME.fullmatch(text)
     if found is None or not (found["minute"] or found["half"]):
         raise bad
@@ -171,14 +171,13 @@ def local(naive: datetime, zone: ZoneInfo) -> Found:
 
 
 def remarks(dates: Iterable[int], zone: ZoneInfo, hour: time) -> list[str]:
-    """What is to be said of the dates of something that comes again at the same hour, where a day has it twice, or not
-    at all."""
+    """Return the notes on dates repeated at the same `hour`: days on which that local time comes twice, or never."""
     days = {in_zone(at, zone).date() for at in dates}
     return [note for day in sorted(days) if (note := local(datetime.combine(day, hour), zone).note)]
 
 
 def parse_every(text: str, option: str) -> int:
-    """Days from one date to the next. Raises BadInput."""
+    """Parse an interval of EVERY_FORMS; return days. Raises BadInput."""
     words = " ".join(text.lower().split()).removeprefix("every ")
     if words in _WORDS:
         return _WORDS[words]
@@ -198,17 +197,17 @@ def every_words(days: int) -> str:
 
 
 def parse_zone(text: str, option: str) -> ZoneInfo:
-    """A zone of the IANA database. Raises BadInput."""
+    """Parse the name of a zone of the IANA database. Raises BadInput."""
     try:
         return ZoneInfo(text)
     except (LookupError, ValueError, OSError):  # none; `../etc`; `Europe`, which is a folder
         near = difflib.get_close_matches(text, available_timezones(), n=3)
-        hint = f"did you mean {' or '.join(near)}?" if near else "write one as Europe/Berlin or UTC"
+        hint = f"did you mean {' or '.join(near)}?" if near else "write one, as in Europe/Berlin or UTC"
         raise BadInput(f"{option}: {quoted(text)} is not a time zone of the IANA database; {hint}") from None
 
 
 def host_zone(environ: Mapping[str, str] = os.environ, etc: Path = Path("/etc")) -> ZoneInfo:
-    """This host's zone, by its name. Raises BadInput where nothing tells that."""
+    """Return this host's zone. Raises BadInput if its name is unknown."""
     names = [environ["TZ"].removeprefix(":")] if environ.get("TZ") else []
     if not names:
         with suppress(OSError):  # none, or a copy
@@ -222,14 +221,14 @@ def host_zone(environ: Mapping[str, str] = os.environ, etc: Path = Path("/etc"))
             continue
     if not environ.get("TZ") and not clocks.daylight and clocks.timezone == 0:
         return ZoneInfo("UTC")
-    raise BadInput("this host's time zone has no name; write --zone Europe/Berlin, or set TZ")
+    raise BadInput("the name of this host's time zone is unknown; write --zone Europe/Berlin, or set TZ")
 
 
 # Words
 
 
 def in_zone(at: float, zone: ZoneInfo | None) -> datetime:
-    """An instant by the clocks of that zone; None: of this host's."""
+    """An instant in local time of `zone`; None: of this host."""
     return datetime.fromtimestamp(at, UTC).astimezone(zone)
 
 
@@ -239,7 +238,7 @@ def date_words(at: float, zone: ZoneInfo | None) -> str:
 
 
 def span_words(start: float, end: float, zone: ZoneInfo | None) -> str:
-    """`Tue 2026-12-01 14:00 to 16:00`; with the end's offset where clocks are changed between them, on one day."""
+    """`Tue 2026-12-01 14:00 to 16:00`; with the end's UTC offset if clocks change between them on the same day."""
     first, last, words = in_zone(start, zone), in_zone(end, zone), date_words(end, zone)
     if first.date() == last.date():
         words = words.split()[-1] + (last.isoformat()[-6:] if first.utcoffset() != last.utcoffset() else "")

@@ -24,8 +24,8 @@ def unwell(device: RcState | None) -> str:
     """Why a device that is not lost does not work at present; empty: it does."""
     if device is None or device.unwell is None or device.health != "ok":
         return ""
-    said = device.unwell
-    return f"unwell since {clock(-said.since)}: {said.why}; lost in {span(max(1, said.left))} unless it recovers"
+    report = device.unwell
+    return f"unwell since {clock(-report.since)}: {report.why}; lost in {span(max(1, report.left))} unless it recovers"
 
 
 def remarks(view: RcView) -> Iterator[str]:

@@ -1,6 +1,6 @@
 """Groups of commands whose modules are imported when they are used, and the groups below `zscout`.
 
-A table is all that `--help` and completion need, so that neither loads Zenoh, Rich or Rerun.
+`--help` and completion need only these tables, so neither loads Zenoh, Rich or Rerun.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ import click
 from click.shell_completion import CompletionItem
 
 Headings: TypeAlias = Mapping[str, Mapping[str, tuple[str, str]]]
-"""Heading: name: the command, as `module:attribute` below `zscout`, and its line in the help."""
+"""By heading and name: the command, as `module:attribute` below `zscout`, and its line in the help."""
 MAX_SHOWN: Final = 40
-"""Characters of an unknown command that are repeated."""
+"""Characters of an unknown command that the error repeats."""
 
 
 class InfraExit(Exception):
-    """A failure of zscout's own, its cause, of a command with `--infra-exit`, whose value is the exit code."""
+    """zscout itself failed (the exception's cause) in a command with `--infra-exit CODE`."""
 
     def __init__(self, code: int) -> None:
         super().__init__(code)
@@ -34,14 +34,16 @@ def at_terminal() -> bool:
 
 
 def instead(text: str) -> dict[str, str]:
-    """Name: what to write instead, from a text such as `status = ps queue; book = reserve`."""
+    """Parse a text such as `status = ps queue; book = reserve`: {"ps": "status", ...}."""
     parts = (part.strip().partition(" = ") for part in text.replace("\n", ";").split(";"))
     return {name: words for words, _, names in parts for name in names.split()}
 
 
 class LazyGroup(click.Group):
-    """The commands of `headings`, and hidden ones for `old` spellings (name: the new words), of which `own` have a
-    command of their own. `instead` has what to write for old spellings, with an option too, and for habits."""
+    """The commands of `headings`, and hidden commands for `old` spellings (name: the new words).
+
+    own: old spellings with a command of their own, by name. instead: the words to write for old spellings, with or
+    without an option, and for names of other programs."""
 
     def __init__(
         self,
@@ -135,7 +137,7 @@ booking = LazyGroup(
     "booking",
     headings={
         "Commands": {
-            "list": ("cli.bookings.listing:bookings", "List bookings: who has which devices, and when."),
+            "list": ("cli.bookings.listing:bookings", "List bookings: owner, devices and times."),
             "show": ("cli.bookings.listing:show", "Show one booking with all its dates."),
             "cancel": ("cli.bookings.listing:unbook", "Cancel a booking, or one date of it."),
             "export": ("cli.bookings.calendar:export", "Write bookings as iCalendar files."),

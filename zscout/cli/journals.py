@@ -1,4 +1,4 @@
-"""What the journals of all candidates tell, as people ask for it and read it."""
+"""Shared by `zscout history` and `usage`: options, the query of the candidates' journals, and words for past holds."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Final
 import click
 from msgspec import structs
 
-from zscout.cli.common import LOOK_FOR_RCM, F, Failed, Parsed, see_rcm
+from zscout.cli.common import FIND_RCM_S, F, Failed, Parsed, see_rcm
 from zscout.config.fleet import Fleet
 from zscout.config.strict import DURATIONS, BadInput, parse_duration, quoted
 from zscout.keyexpr import MAX_NAME, check_need
@@ -27,11 +27,11 @@ if TYPE_CHECKING:
 MAX_AGO: Final = 1e9
 PAST_FORMS: Final = f"{DURATIONS}, or a date as in yesterday, 2026-11-20 or 2026-11-20T14:30"
 FORMULA: Final = ("=", "+", "-", "@")
-"""How a cell begins that a spreadsheet would compute."""
+"""Beginnings of cells that a spreadsheet would compute."""
 
 
 def parse_past(text: str, option: str) -> float:
-    """Seconds ago, from a duration or a time of this host's clock and zone. Raises BadInput."""
+    """Parse a duration, or a time of this host's clock and zone; return seconds ago. Raises BadInput."""
     ago: float | None = None
     if (seconds := parse_duration(text)) is not None:
         ago = float(seconds)
@@ -50,7 +50,7 @@ def parse_past(text: str, option: str) -> float:
 
 
 def _date(text: str) -> datetime:
-    """A date and time, or the midnight with which `today` or `yesterday` begins. Raises ValueError."""
+    """Parse a date and time; `today` and `yesterday` mean the midnight at their start. Raises ValueError."""
     days = {"today": 0, "yesterday": 1}.get(text.lower())
     if days is None:
         return datetime.fromisoformat(text)
@@ -108,10 +108,10 @@ def names_of(fleet: Fleet, users: Sequence[str], group: str | None) -> list[str]
 
 
 async def ask_journals(client: Client, asked: HistoryAsk, most: int) -> FleetHistory:
-    """The latest holds, `most` at most, from as few journals as know all that any knows. Raises Failed where none
-    answers, and NobodyThere where no candidate is seen."""
+    """Return the latest holds, at most `most`, from as few journals as hold all known entries. Raises Failed if no
+    journal answers, NobodyThere if no candidate is seen."""
     try:
-        return await asking.ask_journals(client.mesh, client.fleet, asked, most, look=LOOK_FOR_RCM)
+        return await asking.ask_journals(client.mesh, client.fleet, asked, most, look=FIND_RCM_S)
     except asking.NoCandidate as error:
         await see_rcm(client, 0.0)
         raise Failed(str(error)) from None
@@ -122,30 +122,30 @@ async def ask_journals(client: Client, asked: HistoryAsk, most: int) -> FleetHis
 # Words
 
 
-def remarks(told: FleetHistory) -> Iterable[str]:
-    for one in told.unknown:
-        yield f"from {local(one.began)} to {local(one.ended)} the journals are incomplete: {told.causes(one)}"
-    if told.without:
-        yield f"no journal of {', '.join(told.without)}: off, older than 0.3.0, or too slow"
+def remarks(answer: FleetHistory) -> Iterable[str]:
+    for gap in answer.unknown:
+        yield f"from {local(gap.began)} to {local(gap.ended)} the journals are incomplete: {answer.causes(gap)}"
+    if answer.without:
+        yield f"no journal of {', '.join(answer.without)}: off, older than 0.3.0, or too slow"
 
 
-def as_json(told: FleetHistory, fleet: str, **of: object) -> dict[str, Any]:
+def as_json(answer: FleetHistory, fleet: str, **of: object) -> dict[str, Any]:
     candidates: list[dict[str, Any]] = [
         {
             "host": host,
-            "since": None if one.since is None else utc(one.since),
-            "gaps": [structs.asdict(gap) | _times(gap.began, gap.ended) for gap in one.gaps],
+            "since": None if journal.since is None else utc(journal.since),
+            "gaps": [structs.asdict(gap) | _times(gap.began, gap.ended) for gap in journal.gaps],
         }
-        for host, one in sorted(told.journals.items())
+        for host, journal in sorted(answer.journals.items())
     ]
     return {
         "fleet": fleet,
-        "since": utc(told.window.began),
-        "until": utc(told.window.ended),
+        "since": utc(answer.window.began),
+        "until": utc(answer.window.ended),
         **of,
-        "more": told.more,
-        "gaps": [_times(one.began, one.ended) | {"why": told.causes(one)} for one in told.unknown],
-        "candidates": candidates + [{"host": host, "since": None, "gaps": None} for host in told.without],
+        "more": answer.more,
+        "gaps": [_times(gap.began, gap.ended) | {"why": answer.causes(gap)} for gap in answer.unknown],
+        "candidates": candidates + [{"host": host, "since": None, "gaps": None} for host in answer.without],
     }
 
 
@@ -158,8 +158,8 @@ def local(at: float) -> str:
 
 
 def person(hold: PastHold, *, proven: bool) -> str:
-    """Whose a hold was: the name of the certificate where those are `proven`, else the user that its program told; of
-    one that told none the host."""
+    """Return the holder: the name of its certificate if those are `proven`, else the user that its program named, else
+    its host."""
     return hold.client.partition("/")[0] if proven else _owner(hold)
 
 
@@ -172,21 +172,21 @@ def held(hold: PastHold, now: float) -> float:
 
 
 def used(hold: PastHold, now: float) -> dict[str, float | None]:
-    """Seconds for which each RC was used, no longer than it is known to have been held; None: it did not tell."""
+    """Return the seconds of use by RC, bounded by the hold's known length; None: the RC reported no use."""
     most = held(hold, now)
     return {rc: round(min(hold.used[rc], most), 3) if rc in hold.used else None for rc in hold.rcs}
 
 
 def used_sum(hold: PastHold, now: float) -> float | None:
-    """RC-seconds of it; None: not all told."""
-    told = [seconds for seconds in used(hold, now).values() if seconds is not None]
-    return round(sum(told), 3) if len(told) == len(hold.rcs) else None
+    """Return the RC-seconds of use; None unless all RCs reported theirs."""
+    reported = [seconds for seconds in used(hold, now).values() if seconds is not None]
+    return round(sum(reported), 3) if len(reported) == len(hold.rcs) else None
 
 
 def ending(hold: PastHold) -> str:
     if hold.ended is None:
-        return "stands"
-    words = {"unheard": "end not heard", "client_lost": "client lost", "handed_over": "handed over"}
+        return "in force"
+    words = {"unheard": "end not seen", "client_lost": "client lost", "handed_over": "handed over"}
     by = ""
     if hold.by is not None:
         by = f" by {hold.by.arc} of {_owner(hold.by)}"
@@ -203,7 +203,7 @@ def _times(began: float, ended: float | None) -> dict[str, str | None]:
 
 
 def print_csv(columns: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
-    """CSV whose texts no spreadsheet computes."""
+    """Print CSV; texts that a spreadsheet would compute are quoted."""
     writer = csv.writer(sys.stdout, lineterminator="\n")
     writer.writerow(columns)
     for row in rows:
@@ -216,16 +216,16 @@ def _cell(cell: object) -> object:
     return f"'{clean(cell)}" if cell.startswith(FORMULA) else clean(cell)
 
 
-def print_remarks(told: FleetHistory, *, err: bool = False) -> None:
-    for line in remarks(told):
+def print_remarks(answer: FleetHistory, *, err: bool = False) -> None:
+    for line in remarks(answer):
         click.secho(clean(line), fg="yellow", err=err)
 
 
-def holds_table(title: str, told: FleetHistory, holds: Sequence[PastHold], *, proven: bool) -> Table:
+def holds_table(title: str, answer: FleetHistory, holds: Sequence[PastHold], *, proven: bool) -> Table:
     rows, styles = [], []
     for hold in holds:
         waited = "?" if hold.waited is None else span(hold.waited)
-        lasted = span(held(hold, told.window.ended)) + (" or more" if hold.late or hold.outcome == "unheard" else "")
+        lasted = span(held(hold, answer.window.ended)) + (" or more" if hold.late or hold.outcome == "unheard" else "")
         whose = person(hold, proven=proven)
         rows.append(
             (local(hold.began), lasted, hold.arc, whose, str(hold.priority), waited, ending(hold), " ".join(hold.rcs))

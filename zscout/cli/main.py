@@ -1,7 +1,7 @@
 """The `zscout` command: one group whose subcommands are imported when they are used.
 
-The table below is all that `zscout --help` and completion need, so that neither loads Zenoh, Rich or Rerun.
-Every error ends here as one line on stderr and an exit code:
+`zscout --help` and completion need only the table below, so neither loads Zenoh, Rich or Rerun.
+Every error becomes one line on stderr and an exit code:
 
 0 done, 1 could not (refused, lost), 2 bad input, 3 no RCM on the mesh, 128 + n by signal n (130: Ctrl-C).
 `zscout request -- COMMAND` has codes of its own; see its help.
@@ -78,7 +78,7 @@ OLD: Final = {
     "keys": "doctor --keys",
     "watch": "motion",
 }
-"""What to write instead of old spellings."""
+"""The new words, by old spelling."""
 HABITS: Final = """
 status = ps list ls queue squeue sinfo who show info jobs stat state devices nodes hosts; status --watch = top htop
 request = lock hold get grab claim alloc allocate salloc ask wait checkout submit
@@ -92,7 +92,7 @@ drain = cordon; uncordon = undrain resume; doctor = check diagnose debug ping he
 node = daemon serve up agent server; cert = certs certificate login; simulate = sim simulator
 motion = detect camera; --version = version; --help = help
 """
-"""What to write, and names that people try for it and that never were commands."""
+"""Commands, and names of other programs that people try for them."""
 INSTEAD: Final = {
     **instead(HABITS),
     **OLD,
@@ -104,7 +104,7 @@ OK, COULD_NOT, BAD_INPUT, NOBODY, INTERRUPTED = 0, 1, 2, 3, 130
 
 
 class OneLineErrors(LazyGroup):
-    """Prints errors as one line. An int that a command returns is the exit code."""
+    """Prints errors on one line. If a command returns an int, that is the exit code."""
 
     def main(
         self,
@@ -123,8 +123,8 @@ class OneLineErrors(LazyGroup):
 
 
 def run_command(call: Callable[[], Any], program: str = "zscout") -> Any:
-    """Return what `call` returns; print an error that people can mend as one line that begins with `program`, and
-    return its exit code."""
+    """Return the result of `call`; for an error that users can fix print one line that begins with `program`, and
+    return the exit code."""
     try:
         code = call()
         sys.stdout.flush()
@@ -137,7 +137,7 @@ def run_command(call: Callable[[], Any], program: str = "zscout") -> Any:
         code, line = known or (COULD_NOT, "".join(traceback.format_exception(cause)))
         code = code if infra_exit is None else infra_exit
         if line:
-            # Where nobody reads it, the code still tells.
+            # If stderr is closed, the exit code remains.
             with suppress(OSError):
                 click.echo(re.sub("^zscout:", f"{program}:", line), err=True)
     _drop_unwritten()
@@ -145,8 +145,8 @@ def run_command(call: Callable[[], Any], program: str = "zscout") -> Any:
 
 
 def explain(error: BaseException) -> tuple[int, str] | None:
-    """The exit code and the line for an error that people can mend; None: a bug, to be shown in full."""
-    if isinstance(error, OSError) and _nobody_reads(error):
+    """Return exit code and line for an error that users can fix; None: a bug, printed with its traceback."""
+    if isinstance(error, OSError) and _output_closed(error):
         return COULD_NOT, ""
     if why := shortage(error):
         return COULD_NOT, f"zscout: {why}"
@@ -194,7 +194,7 @@ def explain(error: BaseException) -> tuple[int, str] | None:
 
 
 def usage_words(error: click.UsageError) -> str:
-    """The words of an error of click's in the voice of the others: the option, what is wrong, what to write."""
+    """Rewrite an error of click in the form of the others: option, fault, remedy."""
     words = error.message
     param, hint = getattr(error, "param", None), getattr(error, "param_hint", None)
     name = hint if isinstance(hint, str) else ""
@@ -218,7 +218,7 @@ def usage_words(error: click.UsageError) -> str:
 
 
 def _meant(error: click.NoSuchOption, near: Sequence[str]) -> str:
-    """The options that an unknown one may stand for; click also names some that are hardly like it."""
+    """Suggest options for an unknown option; click's own suggestions are too loose."""
     params = error.ctx.command.params if error.ctx is not None else []
     known = {name for param in params for name in param.opts}
     meant = [name for name in OTHER_OPTIONS.get(error.option_name, ()) if name in known]
@@ -233,7 +233,7 @@ OTHER_OPTIONS: Final = {
     "--from": ("--since",),
     "--reason": ("--comment",),
 }
-"""Options that other commands or other programs have, and those that may be meant."""
+"""Options of other commands or programs, and the options here that may be meant."""
 
 _CLICK_WORDS: Final = (
     (r"'((?:[^'\\]|\\.)*)'", r'"\1"'),
@@ -247,7 +247,7 @@ _CLICK_WORDS: Final = (
     (r"^No such command (\"[^\"]*\")", r"there is no command \1"),
     (r"^Option (\S+) does not take a value", r"\1 takes no value"),
 )
-"""Words of click's, and those that are printed instead."""
+"""Patterns in click's messages, and their replacements."""
 
 
 def _line(text: str) -> str:
@@ -256,15 +256,15 @@ def _line(text: str) -> str:
     return " ".join(clean(text).split())
 
 
-def _nobody_reads(error: OSError) -> bool:
-    """Whether it came of our own output: its pipe was closed, or its terminal, while SIGHUP is ignored (nohup)."""
+def _output_closed(error: OSError) -> bool:
+    """Return True if writing our own output failed: its pipe was closed, or its terminal while SIGHUP is ignored."""
     if error.errno != errno.EIO:
         return isinstance(error, BrokenPipeError)
-    return any(map(_gone, (sys.stdout, sys.stderr)))
+    return any(map(_terminal_closed, (sys.stdout, sys.stderr)))
 
 
-def _gone(stream: IO[str]) -> bool:
-    """Whether it is a terminal that was closed; others have a size, or ENOTTY."""
+def _terminal_closed(stream: IO[str]) -> bool:
+    """Return True for a closed terminal; an open terminal has a size, other streams raise ENOTTY."""
     try:
         os.get_terminal_size(stream.fileno())
     except OSError as error:
@@ -273,7 +273,7 @@ def _gone(stream: IO[str]) -> bool:
 
 
 def _drop_unwritten() -> None:
-    """What can't be written is dropped: Python tries again at exit, and would complain."""
+    """Drop output that can't be written: otherwise Python tries again at exit, and prints an error."""
     for stream in (sys.stdout, sys.stderr):
         try:
             stream.flush()
@@ -293,7 +293,7 @@ def _drop_unwritten() -> None:
     "--fleet",
     metavar="FILE",
     type=click.Path(path_type=Path),
-    help="The fleet file. Default: the one that $ZSCOUT_FLEET names, else a fleet named zscout.",
+    help="The fleet file. Default: the file in $ZSCOUT_FLEET, else a fleet named zscout.",
 )
 @click.option("-v", "--verbose", is_flag=True, help="Log to stderr what the mesh client does.")
 @click.version_option(__version__, "--version", message="%(prog)s %(version)s")
@@ -311,7 +311,7 @@ def main(ctx: click.Context, fleet: Path | None, verbose: bool) -> None:
       zscout status --watch
       zscout why survey
     """
-    if ctx.invoked_subcommand == "node":  # it has its own log, and its file names the fleet
+    if ctx.invoked_subcommand == "node":  # a node has its own log, and its file names the fleet
         if fleet is not None:
             raise click.UsageError('--fleet is for other commands; write fleet = "FILE" under [node] in the node file')
         return

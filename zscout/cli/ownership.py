@@ -1,4 +1,4 @@
-"""Whose a booking, request or component is; and the question before another user's is touched."""
+"""Owners of bookings, requests and components, and the question before another user's is touched."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ MAX_NAMED: Final = 8
 
 
 class User(NamedTuple):
-    """The user of this program, and the host or certificate that it comes from. `proved`: certificates prove names."""
+    """The user of this program, with its host or certificate. `proved`: certificates prove names."""
 
     name: str
     host: str
@@ -45,8 +45,8 @@ def whose(owner: str, who: Who | None) -> str:
 
 
 async def ask_for_others(client: Client, others: Iterable[str], verb: str, *, yes: bool) -> None:
-    """Ask before `verb` is done to what other users own, in words. A user whom the fleet refuses it is not asked.
-    Raises Failed for a no."""
+    """Ask before doing `verb` to `others`, the words for what other users own. Users without the right are not asked:
+    the fleet refuses them. Raises Failed for a no."""
     named = [*others]
     allowed = client.fleet.security is None or "operator" in client.fleet.access.ranks_of(client.mesh.me.host)
     if yes or not named or not allowed:

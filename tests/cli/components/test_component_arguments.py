@@ -61,7 +61,7 @@ def test_how_a_component_stands_in_words() -> None:
     assert words("running", host="anvil", reason="best of 3") == "runs on anvil"
     assert words("waiting", reason="no host has gpu") == "waits for a host: no host has gpu"
     assert words("moving", host="anvil", to="bellows") == "is moving from anvil to bellows"
-    assert words("backing_off", reason="exit code 3") == "failed, and will be started again: exit code 3"
+    assert words("backing_off", reason="exit code 3") == "failed, and will be restarted: exit code 3"
     assert words("ended") == "has ended"
     assert words("given_up", reason="exit code 3") == "is given up: exit code 3"
 

@@ -71,7 +71,7 @@ def test_start_list_and_stop(fleet: CliFleet) -> None:
     other = fleet.zscout("start", "counter", "--set", "period=0.2")
     assert (other.returncode, other.stdout) == (1, "")
     assert other.stderr.startswith(
-        "zscout: counter already exists with another kind or other settings; give this one another --name, "
+        "zscout: counter already exists with another kind or other settings; give another --name, "
     )
     assert other.stderr.endswith("zscout component stop counter\n")
 

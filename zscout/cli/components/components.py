@@ -45,7 +45,7 @@ async def components(name: str | None, only_kinds: bool, watch: bool, as_json: b
     """
     if only_kinds:
         if name is not None or watch:
-            raise BadInput("--kinds lists what can be started; leave NAME and --watch out")
+            raise BadInput("--kinds takes no NAME and no --watch; leave them out")
         await _kinds(as_json=as_json)
         return
     async with AsyncExitStack() as stack:
@@ -74,21 +74,22 @@ async def kinds(as_json: bool) -> None:
 
 
 class Listing:
-    """Components as placer, nodes and load reports describe them."""
+    """The components of a fleet, from the placer, the nodes and the load reports."""
 
     def __init__(self, client: Client, name: str | None) -> None:
         self.client, self.name = client, name
         self.placer = placer_of(client, None if name is None else {name})
         self.fleet_view = FleetView(client)
         self._began: dict[tuple[str, int], Ns] = {}
-        """When each incarnation that runs was started, on this host's clock."""
+        """Start of each running incarnation, on this host's clock."""
 
     async def find(self) -> None:
-        """All of them, with what they use. Raises NobodyThere; Failed for a name that nobody knows."""
+        """Wait for the components and for the load reports of their hosts. Raises NobodyThere; Failed if `name` is
+        unknown."""
         await self.placer.refresh()
         if self.name is not None and self.name not in self.placer.placements:
             raise await unknown_here(self.placer, self.name)
-        hosts = {one.host for one in self._running()}
+        hosts = {placement.host for placement in self._running()}
 
         def reported() -> bool:
             found = [self.fleet_view.hosts.get(host or "") for host in hosts]
@@ -100,13 +101,13 @@ class Listing:
         await self.find_ages()
 
     async def refresh(self) -> None:
-        # Without a leader what was known last is shown on.
+        # Without a leader the last known state stays on the screen.
         await self.placer.try_refresh()
         await self.find_ages()
 
     async def find_ages(self) -> None:
-        """Asks the nodes since when what runs has run, where that is not known."""
-        running = {(one.component, one.incarnation) for one in self._running()}
+        """Ask the nodes for the uptime of running components whose start is not known yet."""
+        running = {(placement.component, placement.incarnation) for placement in self._running()}
         self._began = {key: began for key, began in self._began.items() if key in running}
         if running <= self._began.keys():
             return
@@ -118,49 +119,49 @@ class Listing:
                     self._began[key] = now - round(view.uptime * SECOND)
 
     def overview(self) -> Overview:
-        rows, styles = [], [STYLES.get(one.state, "") for one in self._all()]
-        for one in self._all():
-            use, up = self._use(one), self._uptime(one)
-            where = f"{one.host or '-'} > {one.to}" if one.to is not None else one.host or "-"
+        rows, styles = [], [STYLES.get(placement.state, "") for placement in self._all()]
+        for placement in self._all():
+            use, up = self._use(placement), self._uptime(placement)
+            where = f"{placement.host or '-'} > {placement.to}" if placement.to is not None else placement.host or "-"
             since = "-" if up is None else f"{terminal.clock(-up)} ({terminal.span(up)})"
-            moves = str(one.moves) + (f" ({one.dead * 1000:.0f} ms)" if one.dead is not None else "")
+            moves = str(placement.moves) + (f" ({placement.dead * 1000:.0f} ms)" if placement.dead is not None else "")
             cores, memory = ("-", "-") if use is None else (f"{use.cpu:.2f}", f"{use.memory / 2**20:.0f} MiB")
-            stands = (one.component, one.spec.kind, one.state.replace("_", " "), where, since)
-            rows.append((*stands, str(one.restarts), moves, cores, memory, one.reason))
+            state = (placement.component, placement.spec.kind, placement.state.replace("_", " "), where, since)
+            rows.append((*state, str(placement.restarts), moves, cores, memory, placement.reason))
         columns = ("NAME", "KIND", "STATE", "HOST", "UP", "RESTARTS", "MOVES", "CORES", "MEMORY", "WHY")
         table = Table("Components", columns, rows, styles, ("RESTARTS", "MOVES", "KIND"))
         running = self._running()
-        hosts = len({one.host for one in running})
+        hosts = len({placement.host for placement in running})
         on = f" on {terminal.many(hosts, 'host')}" if running else ""
         cordoned = f"; cordoned: {', '.join(sorted(self.placer.cordoned))}" if self.placer.cordoned else ""
         headline = f"Fleet {self.client.fleet.name}: {len(running)} of {len(self._all())} run{on}{cordoned}"
         return Overview(headline, [table])
 
     def as_object(self) -> dict[str, Any]:
-        """What `--json` prints: `cpu` in cores, `memory` in bytes, spans in seconds."""
+        """Return the object of `--json`: `cpu` in cores, `memory` in bytes, durations in seconds."""
         found = []
-        for one in self._all():
-            use = self._use(one)
+        for placement in self._all():
+            use = self._use(placement)
             used = {name: getattr(use, name, None) for name in ("cpu", "memory", "processes")}
-            found.append(placement_object(one) | {"uptime": self._uptime(one), **used})
+            found.append(placement_object(placement) | {"uptime": self._uptime(placement), **used})
         cordoned = sorted(self.placer.cordoned)
         return {"fleet": self.client.fleet.name, "components": found, "cordoned": cordoned}
 
     def _all(self) -> list[Placement]:
-        return [one for _, one in sorted(self.placer.placements.items())]
+        return [placement for _, placement in sorted(self.placer.placements.items())]
 
     def _running(self) -> list[Placement]:
-        return [one for one in self._all() if one.state in ("running", "moving")]
+        return [placement for placement in self._all() if placement.state in ("running", "moving")]
 
-    def _use(self, one: Placement) -> ComponentUse | None:
-        host = self.fleet_view.hosts.get(one.host or "")
+    def _use(self, placement: Placement) -> ComponentUse | None:
+        host = self.fleet_view.hosts.get(placement.host or "")
         if host is None or host.load is None or self.fleet_view.stale(host):
             return None
-        uses = (use for use in host.load.components if use.component == one.component)
-        return next((use for use in uses if use.incarnation == one.incarnation), None)
+        uses = (use for use in host.load.components if use.component == placement.component)
+        return next((use for use in uses if use.incarnation == placement.incarnation), None)
 
-    def _uptime(self, one: Placement) -> float | None:
-        began = self._began.get((one.component, one.incarnation))
+    def _uptime(self, placement: Placement) -> float | None:
+        began = self._began.get((placement.component, placement.incarnation))
         return None if began is None else (self.client.mesh.now() - began) / SECOND
 
 
@@ -174,12 +175,12 @@ async def _kinds(*, as_json: bool) -> None:
     if not nodes:
         raise common.NobodyThere(f"no node of fleet {fleet} answered; start zscout-node, or see its log")
     if as_json:
-        hosts = [{"host": one.host, "kinds": sorted(one.kinds or ())} for one in nodes]
+        hosts = [{"host": node.host, "kinds": sorted(node.kinds or ())} for node in nodes]
         terminal.print_json({"fleet": fleet, "hosts": hosts})
         return
-    kinds = sorted({kind for one in nodes for kind in one.kinds or ()})
-    rows = [(kind, ", ".join(one.host for one in nodes if kind in (one.kinds or ()))) for kind in kinds]
-    nothing = [one.host for one in nodes if not one.kinds]
-    without = f"; nothing on {', '.join(nothing)}" if nothing else ""
+    kinds = sorted({kind for node in nodes for kind in node.kinds or ()})
+    rows = [(kind, ", ".join(node.host for node in nodes if kind in (node.kinds or ()))) for kind in kinds]
+    without_kinds = [node.host for node in nodes if not node.kinds]
+    without = f"; none on {', '.join(without_kinds)}" if without_kinds else ""
     headline = f"Fleet {fleet}: {len(kinds)} kinds can be started{without}"
     Overview(headline, [Table("Kinds", ("KIND", "ON"), rows)]).print()

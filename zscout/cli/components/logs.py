@@ -1,4 +1,4 @@
-"""`zscout component logs`: what a component wrote, and what it writes."""
+"""`zscout component logs`: print the output of a component, and follow it."""
 
 from __future__ import annotations
 
@@ -17,18 +17,17 @@ from zscout.cli.components.placing import (
     component_argument,
     host_option,
     placer_of,
-    standing,
+    state_words,
     unknown_here,
 )
 from zscout.cli.fleet.fleet_view import see_hosts
 from zscout.mesh.supervision import done_within
 from zscout.messages import Output, Placement, ReadOutput
 
-READ_TIMEOUT: Final = 2.0
-READ_EVERY: Final = 0.25
-"""Seconds between two looks for more."""
-UNKNOWN: Final = 3
-"""Looks in a row at which the placer does not know a component that has ended, until that is believed."""
+READ_TIMEOUT_S: Final = 2.0
+READ_INTERVAL_S: Final = 0.25
+MAX_UNKNOWN_LISTINGS: Final = 3
+"""Listings in a row without the component after which it counts as ended."""
 
 
 @click.command()
@@ -62,7 +61,7 @@ async def logs(name: str, follow: bool, lines: int | None, host: str | None) -> 
 
 
 class Reader:
-    """Reads one component's output, from one host after another. `host`: only there."""
+    """Reads the output of one component on each host in turn, or on `host` alone."""
 
     def __init__(self, client: Client, placer: PlacerClient, name: str, host: str | None) -> None:
         self._client, self._placer, self._name = client, placer, name
@@ -70,14 +69,15 @@ class Reader:
         self._host = host
         self._incarnation = 0
         self._at = 0
-        """Bytes that were read of this incarnation."""
+        """Bytes read of this incarnation."""
 
     @property
     def _record(self) -> Placement | None:
         return self._placer.placements.get(self._name)
 
     async def first(self, *, follow: bool) -> Output:
-        """What it has written, as soon as it was started. Raises Failed, NobodyThere."""
+        """Return the output so far; with `follow`, wait until the component has been started. Raises Failed,
+        NobodyThere."""
         try:
             await common.see_rcm(self._client)
             await self._placer.refresh()
@@ -99,61 +99,61 @@ class Reader:
     async def follow(self, output: Output) -> None:
         found: Output | None = output
         while True:
-            # Without an answer its host is gone or busy, or has forgotten it; the placer knows which.
+            # No answer: the host is gone, busy, or has dropped the output. The placer knows which.
             silent = found is None
             if (found is None or found.over) and (self._only or not await self._successor(silent=silent)):
                 break
             if found is None or not (found.over or found.text):
-                await done_within(READ_EVERY, self._placer.changed.wait())
+                await done_within(READ_INTERVAL_S, self._placer.changed.wait())
                 self._placer.changed.clear()
             found = await self._read()
             if found is not None:
                 self.write(found.text)
         record = self._record
-        ended = standing(record) if record is not None and not self._only else "has ended"
-        self._tell(f"{self._name} {ended}")
+        ended = state_words(record) if record is not None and not self._only else "has ended"
+        self._report(f"{self._name} {ended}")
 
     async def _read(self) -> Output | None:
-        """What is new at its host; None where that does not answer, or knows nothing of it."""
+        """Return the new output; None if the host does not answer or does not know the component."""
         if self._host is None:
             return None
         key = self._client.mesh.keys.component(self._host, self._client.mesh.me)
-        reply = await self._client.mesh.ask_one(key, ReadOutput(self._name, self._at), Output, timeout=READ_TIMEOUT)
+        reply = await self._client.mesh.ask_one(key, ReadOutput(self._name, self._at), Output, timeout=READ_TIMEOUT_S)
         output = reply.message if reply is not None else None
         if output is None or output.incarnation < self._incarnation:
             return None
         if output.incarnation > self._incarnation:
-            begun, self._incarnation = self._incarnation, output.incarnation
-            if begun:
-                self._tell(f"{self._name} continues on {self._host}")
+            earlier, self._incarnation = self._incarnation, output.incarnation
+            if earlier:
+                self._report(f"{self._name} continues on {self._host}")
             if self._at:
                 self._at = 0
                 return await self._read()
         if output.start > self._at and self._at:
-            self._tell(f"{output.start - self._at} bytes came too fast, and are lost")
+            self._report(f"{output.start - self._at} bytes lost: written faster than they could be read")
         self._at = output.end
         return output
 
     async def _read_anywhere(self) -> Output | None:
-        """The same from the host that knows its latest incarnation, whichever that is."""
+        """Like `_read`, from the host with the latest incarnation."""
         if self._only:
             return None
         mesh = self._client.mesh
-        asked = ReadOutput(self._name)
-        replies = await common.ask_nodes(mesh, asked, Output, READ_TIMEOUT)
-        found = [(one.message.incarnation, mesh.keys.host_of(one.key)) for one in replies if one.message]
+        question = ReadOutput(self._name)
+        replies = await common.ask_nodes(mesh, question, Output, READ_TIMEOUT_S)
+        found = [(reply.message.incarnation, mesh.keys.host_of(reply.key)) for reply in replies if reply.message]
         self._host = max(found)[1] if found else self._host
         return await self._read() if found else None
 
     async def _successor(self, *, silent: bool) -> bool:
-        """Waits until it goes on somewhere, if only where it was and its host is merely `silent`; False: it
-        has ended for good. Raises NobodyThere."""
+        """Wait for a newer incarnation, or, if its host was `silent`, for the same to be listed again. Return False
+        if the component has ended for good. Raises NobodyThere."""
         missed = 0
         await self._placer.refresh()
         while True:
             record = self._record
             missed = missed + 1 if record is None else 0
-            if missed >= UNKNOWN:
+            if missed >= MAX_UNKNOWN_LISTINGS:
                 return False
             if record is not None and record.incarnation >= self._incarnation:
                 newer = record.incarnation > self._incarnation
@@ -165,28 +165,28 @@ class Reader:
             await self._placer.wait_changed()
 
     async def _nothing(self) -> common.Failed:
-        """What to raise where there is no output."""
+        """Return the exception for a component without output."""
         if self._only and self._host is not None:
             for line in await absent(self._client.mesh, [self._host]):
                 return common.Failed(f"--host: {line}")
             return common.Failed(f"{self._host} has no output of {self._name}; leave --host out to read its last host")
         if self._record is not None:
-            return common.Failed(f"no host has output of {self._name}: it {standing(self._record)}")
+            return common.Failed(f"no host has output of {self._name}: it {state_words(self._record)}")
         return await unknown_here(self._placer, self._name)
 
     def write(self, text: str) -> None:
-        """To stdout, as it is; at a terminal without what could draw on it."""
+        """Write to stdout; at a terminal with control characters replaced by blanks."""
         if terminal.at_terminal():
             text = "".join(char if char.isprintable() or char in "\n\t" else " " for char in text)
         sys.stdout.write(text)
         sys.stdout.flush()
 
-    def _tell(self, text: str) -> None:
+    def _report(self, text: str) -> None:
         terminal.print_line(terminal.clean(f"-- {text}"), sys.stderr)
 
 
 def last(text: str, lines: int | None) -> str:
-    """The last lines of a text; all of them for None."""
+    """Return the last `lines` lines; None: all."""
     if lines is None:
         return text
     return "".join(text.splitlines(keepends=True)[-lines:]) if lines else ""

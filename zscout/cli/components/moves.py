@@ -37,21 +37,21 @@ async def migrate(name: str, to: str | None, yes: bool, as_json: bool) -> None:
         if before is None:
             raise placing.unknown(name, placer.placements)
         await placing.ask_for_others(client, placer, [name], "move", yes=yes)
-        interrupted = f"{name} is moved all the same; zscout component list tells how that goes"
+        interrupted = f"the move of {name} continues; see zscout component list"
         async with shown.within(None, str, interrupted):
-            after = await _moved(placer, shown, before, to)
+            after = await _move(placer, shown, before, to)
     moved = after.moves > before.moves
     if as_json:
         dead = after.dead if moved else None
         terminal.print_json(placing.placement_object(after) | {"from": before.host, "dead": dead})
     if after.host == before.host:
-        shown.say(f"{name} is on {after.host} already")
+        shown.finish(f"{name} is on {after.host} already")
     else:
-        shown.say(f"{name} went from {before.host} to {after.host}{placing.out_of_work(after) if moved else ''}")
+        shown.finish(f"{name} went from {before.host} to {after.host}{placing.out_of_work(after) if moved else ''}")
 
 
-async def _moved(placer: PlacerClient, shown: placing.Progress, before: Placement, to: str | None) -> Placement:
-    """Moves it, and shows how it goes. Raises Failed where it did not come to that."""
+async def _move(placer: PlacerClient, shown: placing.Progress, before: Placement, to: str | None) -> Placement:
+    """Move a component, and show the progress. Raises Failed if it was not moved."""
     name = before.component
 
     def begun(record: Placement) -> bool:
@@ -68,11 +68,11 @@ async def _moved(placer: PlacerClient, shown: placing.Progress, before: Placemen
         now = placer.placements.get(name, before)
         why = str(refused)
         if refused.code == "not_running" and now.state != "running":
-            why = f"it {placing.standing(now)}; {placing.remedy(now)}"
+            why = f"it {placing.state_words(now)}; {placing.remedy(now)}"
         raise common.Failed(f"{name} was not moved: {why}") from None
     if begun(record):
         while record.state not in ("running", *placing.OVER):
-            shown.update(f"{name} {placing.standing(record)}")
+            shown.update(f"{name} {placing.state_words(record)}")
             await placer.wait_changed()
             record = placer.placements.get(name, record)
         if record.state == "running":
@@ -81,4 +81,4 @@ async def _moved(placer: PlacerClient, shown: placing.Progress, before: Placemen
             raise common.Failed(f"{name} was not moved, it keeps running on {record.host}: {record.reason}")
     elif to == record.host:
         return record
-    raise common.Failed(f"{name} was not moved: it {placing.standing(record)}; {placing.remedy(record)}")
+    raise common.Failed(f"{name} was not moved: it {placing.state_words(record)}; {placing.remedy(record)}")

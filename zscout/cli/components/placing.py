@@ -1,4 +1,4 @@
-"""What the commands about components share: the placer's client, progress on stdout, words."""
+"""Shared by the commands about components: the placer's client, progress on stdout, words."""
 
 from __future__ import annotations
 
@@ -23,24 +23,24 @@ if TYPE_CHECKING:
     from zscout.mesh import Mesh
 
 
-PATIENCE: Final = 15.0
-"""Seconds within which a placer answers, though the lead changes meanwhile."""
-LOOK_FOR_HOSTS: Final = 1.0
-"""Seconds in which nodes answer, and show themselves."""
+PLACER_TIMEOUT_S: Final = 15.0
+"""Long enough for a change of leader meanwhile."""
+FIND_HOSTS_S: Final = 1.0
+"""Within this time nodes answer, and their tokens are seen."""
 OVER: Final = frozenset({"ended", "given_up"})
 """States of a component that will not run again by itself."""
 
 
 def placer_of(client: Client, only: Collection[str] | None = None) -> PlacerClient:
-    return PlacerClient(client.mesh, only, timeout=PATIENCE)
+    return PlacerClient(client.mesh, only, timeout=PLACER_TIMEOUT_S)
 
 
 @asynccontextmanager
 async def connected(
     command: str, only: Collection[str] | None = None, *, as_json: bool
 ) -> AsyncIterator[tuple[Client, Progress, PlacerClient]]:
-    """Client, progress and placer of a command, which knows how all components stand, or those in `only`. Raises
-    NobodyThere, MeshError, RequestRefused."""
+    """Yield client, progress and placer of a command, once the placer has listed all components, or those in `only`.
+    Raises NobodyThere, MeshError, RequestRefused."""
     async with common.connected(command) as client:
         with Progress(quiet=as_json) as shown, placer_of(client, only) as placer:
             await placer.refresh()
@@ -48,36 +48,40 @@ async def connected(
 
 
 async def ask_for_others(client: Client, placer: PlacerClient, names: Iterable[str], verb: str, *, yes: bool) -> None:
-    """Ask before a component of another certificate is touched: a plain mesh has no owners. Raises Failed for a no."""
+    """Ask before touching components of another certificate (a plain mesh has no owners). Raises Failed for a no."""
     found = [placement for name in names if (placement := placer.placements.get(name)) and placement.spec.owner]
-    others = [f"{one.component} of {one.spec.owner}" for one in found if one.spec.owner != client.mesh.me.host]
+    others = [
+        f"{placement.component} of {placement.spec.owner}"
+        for placement in found
+        if placement.spec.owner != client.mesh.me.host
+    ]
     await ownership.ask_for_others(client, others, verb, yes=yes)
 
 
 class Progress(terminal.LiveLine):
-    """How it goes, on stdout: a live line at a terminal, a line for each change in a pipe; nothing if `quiet`."""
+    """Progress on stdout: a live line at a terminal, a line for each change in a pipe, nothing if `quiet`."""
 
     def __init__(self, *, quiet: bool) -> None:
         super().__init__(shown=not quiet)
         self._quiet = quiet
-        self._said = ""
+        self._last = ""
 
     def update(self, text: str) -> None:
         self.draw(text)
-        if text != self._said and not (self.watched or self._quiet):
+        if text != self._last and not (self.watched or self._quiet):
             self.print(text)
-        self._said = text
+        self._last = text
 
-    def say(self, text: str) -> None:
-        """What has come of it, to stay on the screen."""
+    def finish(self, text: str) -> None:
+        """Print a result; it stays on the screen."""
         self.hide()
         if not self._quiet:
             self.print(text)
 
     @asynccontextmanager
     async def within(self, seconds: float | None, late: Callable[[], str], interrupted: str) -> AsyncIterator[None]:
-        """Bounds what is awaited inside. Raises Failed with `late()` when the time is over; by Ctrl-C says on
-        stderr what stays as it is."""
+        """Bound the time of the block. Raises Failed with `late()` after `seconds`; on Ctrl-C prints `interrupted` on
+        stderr."""
         try:
             async with asyncio.timeout(seconds):
                 yield
@@ -89,21 +93,23 @@ class Progress(terminal.LiveLine):
             raise
 
 
-STANDING: Final = {
+STATE_WORDS: Final = {
     "running": "runs on {host}",
     "starting": "is starting on {host}",
     "waiting": "waits for a host{why}",
     "moving": "is moving from {host} to {to}",
-    "backing_off": "failed, and will be started again{why}",
+    "backing_off": "failed, and will be restarted{why}",
     "stopping": "is being stopped on {host}",
     "ended": "has ended{why}",
     "given_up": "is given up{why}",
 }
 
 
-def standing(one: Placement) -> str:
-    why = f": {one.reason}" if one.reason else ""
-    return STANDING[one.state].format(host=one.host or "no host", to=one.to or "another host", why=why)
+def state_words(placement: Placement) -> str:
+    why = f": {placement.reason}" if placement.reason else ""
+    return STATE_WORDS[placement.state].format(
+        host=placement.host or "no host", to=placement.to or "another host", why=why
+    )
 
 
 def remedy(placement: Placement) -> str:
@@ -117,11 +123,11 @@ def remedy(placement: Placement) -> str:
 
 
 async def nodes_of(mesh: Mesh) -> set[str]:
-    return {token.host for token in await mesh.living(mesh.keys.alive_any(Role.NODE), timeout=LOOK_FOR_HOSTS)}
+    return {token.host for token in await mesh.living(mesh.keys.alive_any(Role.NODE), timeout=FIND_HOSTS_S)}
 
 
 async def absent(mesh: Mesh, hosts: Collection[str]) -> list[str]:
-    """A line for each of these hosts that is not on the mesh, with names like it."""
+    """Return an error line for each of these hosts that is not on the mesh, with similar names."""
     nodes = await nodes_of(mesh) if hosts else set()
     hints = {
         host: common.hint_at(host, nodes, "and there are none; start zscout-node there", "there are")
@@ -132,13 +138,13 @@ async def absent(mesh: Mesh, hosts: Collection[str]) -> list[str]:
 
 
 async def ask_nodes(mesh: Mesh, asked: ListComponents) -> list[ComponentList]:
-    replies = await common.ask_nodes(mesh, asked, ComponentList, LOOK_FOR_HOSTS)
+    replies = await common.ask_nodes(mesh, asked, ComponentList, FIND_HOSTS_S)
     lists = (reply.message for reply in replies if reply.message is not None)
     return sorted(lists, key=lambda answer: answer.host)
 
 
 async def check_kind(mesh: Mesh, kind: str) -> None:
-    """Raises Failed where all nodes answer that they lack this kind."""
+    """Raises Failed if every node answers that it lacks this kind."""
     nodes = await nodes_of(mesh)
     answers = {answer.host: answer.kinds for answer in await ask_nodes(mesh, ListComponents())}
     kinds: set[str] = set()
@@ -154,9 +160,9 @@ def unknown(name: str, known: Iterable[str]) -> common.Failed:
 
 
 async def unknown_here(placer: PlacerClient, name: str) -> common.Failed:
-    """The same, after all components have been listed. Raises RequestRefused."""
-    everyone = await placer.request(ListPlacements(), Placements)
-    return unknown(name, (one.component for one in everyone.components))
+    """Like `unknown`, with the names of all components. Raises RequestRefused."""
+    every = await placer.request(ListPlacements(), Placements)
+    return unknown(name, (placement.component for placement in every.components))
 
 
 def out_of_work(placement: Placement) -> str:
@@ -164,17 +170,17 @@ def out_of_work(placement: Placement) -> str:
 
 
 def tail_of(placement: Placement) -> list[str]:
-    """The last lines that a component wrote, unable to draw on the terminal."""
+    """Return the last lines of a component's output, without control characters."""
     return [terminal.clean(line.expandtabs()) for line in placement.tail.splitlines()]
 
 
 def placement_object(placement: Placement) -> dict[str, Any]:
-    """A placement for programs: every field, defaults as well."""
+    """Return every field of a placement, defaults included, for `--json`."""
     return structs.asdict(placement) | {"spec": structs.asdict(placement.spec)}
 
 
 def component_named(text: str, _option: str = "") -> str:
-    """The name of a component as somebody wrote it. Raises BadInput."""
+    """Check the name of a component. Raises BadInput."""
     try:
         return check_name(text, "component")
     except ValueError as error:

@@ -1,4 +1,4 @@
-"""`zscout component start` and `zscout component stop`: have a component run somewhere, and end it."""
+"""`zscout component start` and `zscout component stop`."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ _POWERS: Final = {"": 0, "K": 10, "M": 20, "G": 30, "T": 40}
 
 
 def parse_cores(text: str, what: str) -> float:
-    """Cores of a processor, from `0.5` or `2`. Raises BadInput."""
+    """Parse a number of cores: `0.5`, `2`. Raises BadInput."""
     cores = 0.0
     with suppress(ValueError):
         cores = float(text)
@@ -52,7 +52,7 @@ def parse_cores(text: str, what: str) -> float:
 
 
 def parse_size(text: str, what: str) -> int:
-    """Bytes from `500M`, `1.5G` or `1048576`: K, M, G, T are powers of 1024. Raises BadInput."""
+    """Parse a size in bytes: `500M`, `1.5G`, `1048576`. K, M, G, T are powers of 1024. Raises BadInput."""
     found = _SIZE.fullmatch(text)
     size = int(Decimal(found[1]) * (1 << _POWERS[found[2].upper()])) if found else 0
     if not 0 < size <= MAX_BYTES:
@@ -65,8 +65,8 @@ CORES: Final = common.Parsed("cores", parse_cores)
 
 
 def gather_params(given: str | None, settings: Sequence[str]) -> dict[str, Any]:
-    """The parameters of a component: a JSON object, and `KEY=VALUE` over it; a VALUE that is not JSON is a
-    text. Raises BadInput."""
+    """Return the parameters of a component: a JSON object, overridden by `KEY=VALUE` settings. A VALUE that is not
+    JSON is a text. Raises BadInput."""
     params: dict[str, Any] = {}
     if given is not None:
         try:
@@ -97,22 +97,22 @@ def gather_params(given: str | None, settings: Sequence[str]) -> dict[str, Any]:
 @click.command(context_settings={"show_default": False})
 @click.argument("kind", type=common.NAME, shell_complete=completion.kinds)
 @click.option("--name", metavar="NAME", type=common.NAME, help="Name of the component. Default: its kind.")
-@click.option("--set", "settings", multiple=True, metavar="KEY=VALUE", help="A parameter; a VALUE may be JSON.")
+@click.option("--set", "settings", multiple=True, metavar="KEY=VALUE", help="Set a parameter; VALUE may be JSON.")
 @click.option("--params", metavar="JSON", help="All parameters, as a JSON object.")
 @placing.host_option("--host", "Run only on this host; repeat it for several.", multiple=True)
 @click.option("--label", metavar="LABEL", type=common.NAME, multiple=True, help="A label that its host must have.")
 @click.option("--memory", type=SIZE, default=0, help="Memory that its host must have available, as in 500M.")
-@click.option("--metric", type=click.Choice(METRICS), default="composite", help="Figure by which hosts are compared.")
-@click.option("--policy", type=click.Choice(POLICIES), default="pending", help="How a host is chosen.")
+@click.option("--metric", type=click.Choice(METRICS), default="composite", help="Compare hosts by this figure.")
+@click.option("--policy", type=click.Choice(POLICIES), default="pending", help="Choose the host by this policy.")
 @click.option(
     "--restart",
     type=click.Choice(["never", "on-failure", "always"]),
     default="on-failure",
     show_default=True,
-    help="When to start it again after it ended.",
+    help="When to restart it after it ended.",
 )
-@click.option("--memory-limit", type=SIZE, default=0, help="Memory that it may use, as in 500M.")
-@click.option("--cpu-limit", type=CORES, help="Cores that it may use, as in 0.5.")
+@click.option("--memory-limit", type=SIZE, default=0, help="Limit its memory, as in 500M.")
+@click.option("--cpu-limit", type=CORES, help="Limit the cores it uses, as in 0.5.")
 @click.option("--no-wait", is_flag=True, help="Don't wait until it runs.")
 @timeout_option("Wait this long until it runs, then exit with 1.")
 @common.json_option("Print one JSON object.")
@@ -128,7 +128,7 @@ async def start(
 
     \b
     Exit code: 0 it runs, or has completed; 1 it was refused or given up, or did not run
-    in time; 3 no leader. If it is given up, its last output goes to stderr.
+    in time; 3 no leader. If it is given up, its last output is printed on stderr.
 
     \b
     Examples:
@@ -146,7 +146,7 @@ async def start(
 
         def late() -> str:
             record = placer.placements.get(name)
-            now = f" {placing.standing(record)};" if record is not None else ""
+            now = f" {placing.state_words(record)};" if record is not None else ""
             return f"{name} does not run after {terminal.span(timeout or 0)}:{now} {stays}"
 
         before = placer.placements.get(name)
@@ -163,9 +163,9 @@ async def start(
     if placement.state == "given_up" or (placement.state == "ended" and not placement.wanted):
         for line in placing.tail_of(placement):
             terminal.print_line(line, sys.stderr)
-        raise common.Failed(f"{name} {placing.standing(placement)}; {placing.remedy(placement)}")
+        raise common.Failed(f"{name} {placing.state_words(placement)}; {placing.remedy(placement)}")
     ran = before is not None and before.state == placement.state == "running"
-    shown.say(f"{name} {'already ' if ran else ''}{placing.standing(placement)}")
+    shown.finish(f"{name} {'already ' if ran else ''}{placing.state_words(placement)}")
 
 
 def gather_spec(
@@ -179,21 +179,19 @@ def gather_spec(
     cpu_limit: float | None,
     **same: Any,
 ) -> ComponentSpec:
-    """What is asked for, checked before anybody is asked. Raises BadInput."""
-    # In order, as the placer lists them.
+    """Check the options of `start`, and return the spec to send. Raises BadInput."""
+    # Sorted, as the placer lists them.
     hosts, labels = sorted(set(host)), sorted(set(label))
     if len(hosts) > MAX_RANKED:
-        raise BadInput(
-            f"{len(hosts)} hosts; give --host at most {MAX_RANKED} times, or give them a label and use --label"
-        )
+        raise BadInput(f"{len(hosts)} hosts are too many; give --host at most {MAX_RANKED} times, or use --label")
     if len(labels) > MAX_LABELS:
-        raise BadInput(f"{len(labels)} labels; give --label at most {MAX_LABELS} times")
+        raise BadInput(f"{len(labels)} labels are too many; give --label at most {MAX_LABELS} times")
     given: Any = {"params": gather_params(params, settings), "restart": restart.replace("-", "_")}
     return ComponentSpec(kind=kind, labels=labels, hosts=hosts or None, cpu_limit=cpu_limit or 0.0, **given, **same)
 
 
 async def _place(placer: PlacerClient, name: str, spec: ComponentSpec, before: Placement | None) -> Placement:
-    """Has it placed, without waiting for what comes of that. Raises Failed."""
+    """Place a component; do not wait until it runs. Raises Failed."""
     known = before.incarnation if before is not None else 0
 
     def done(record: Placement) -> bool:
@@ -205,21 +203,21 @@ async def _place(placer: PlacerClient, name: str, spec: ComponentSpec, before: P
         if refused.code != "exists":
             raise
         raise common.Failed(
-            f"{name} already exists with another kind or other settings; give this one another --name, "
-            f"or stop the other first: zscout component stop {name}"
+            f"{name} already exists with another kind or other settings; give another --name, "
+            f"or stop the existing component first: zscout component stop {name}"
         ) from None
 
 
 async def _until_settled(placer: PlacerClient, shown: placing.Progress, name: str, spec: ComponentSpec) -> Placement:
-    """Tells how it goes until it runs, or will not. Raises Failed."""
+    """Show the progress until the component runs or is over. Raises Failed."""
     while True:
         placement = placer.placements.get(name)
         if placement is None:
-            # A new placer that does not know it: placed again it is not placed twice.
+            # A new placer does not know the component yet. Placing it again does not start it twice.
             placement = await _place(placer, name, spec, None)
         if placement.state == "running" or placement.state in placing.OVER:
             return placement
-        shown.update(f"{name} {placing.standing(placement)}")
+        shown.update(f"{name} {placing.state_words(placement)}")
         await placer.wait_changed()
 
 
@@ -232,10 +230,10 @@ async def _until_settled(placer: PlacerClient, shown: placing.Progress, name: st
 @common.json_option("Print one JSON object.")
 @common.runs
 async def stop(names: Sequence[str], timeout: float | None, yes: bool, as_json: bool) -> None:
-    """End components for good: each is asked to end, and killed if it does not.
+    """End components for good: ask each to end, and kill it if it does not.
 
-    Returns when all have ended; what they held is given back. A component that has already ended is no error. In a
-    secured fleet it asks before it stops another user's; if stdin is not a terminal, add --yes.
+    Returns when all have ended and their devices are released. A component that has already ended is no error. In a
+    secured fleet the command asks before it stops another user's component; if stdin is not a terminal, add --yes.
 
     \b
     Examples:
@@ -243,33 +241,33 @@ async def stop(names: Sequence[str], timeout: float | None, yes: bool, as_json: 
       zscout component stop blue green --timeout 10
     """
     names = sorted(set(names))
-    stays = f"{', '.join(names)} will be stopped all the same; zscout component list tells how that goes"
+    stays = f"stopping {', '.join(names)} continues; see zscout component list"
     async with placing.connected("stop", names, as_json=as_json) as (client, shown, placer):
         await placing.ask_for_others(client, placer, names, "stop", yes=yes)
-        refused = set[str]()
+        refused_names = set[str]()
 
         def lasting() -> str:
-            records = (placer.placements.get(name) for name in names if name not in refused)
-            running = (one for one in records if one and one.state not in placing.OVER)
-            return "; ".join(f"{one.component} {placing.standing(one)}" for one in running)
+            records = (placer.placements.get(name) for name in names if name not in refused_names)
+            running = (record for record in records if record and record.state not in placing.OVER)
+            return "; ".join(f"{record.component} {placing.state_words(record)}" for record in running)
 
         def late() -> str:
             return f"after {terminal.span(timeout or 0)} {lasting()}; {stays}"
 
         async with shown.within(timeout, late, stays):
             ends = await asyncio.gather(*(_end(placer, name) for name in names), return_exceptions=True)
-            refused |= {name for name, end in zip(names, ends, strict=True) if isinstance(end, BaseException)}
+            refused_names |= {name for name, end in zip(names, ends, strict=True) if isinstance(end, BaseException)}
             while words := lasting():
                 shown.update(words)
                 await placer.wait_changed()
         last = {end.component: end for end in ends if isinstance(end, Placement)}
         last |= {name: record for name, record in placer.placements.items() if name in last}
     if as_json:
-        terminal.print_json({"components": [placing.placement_object(one) for one in last.values()]})
-    for one in last.values():
-        shown.say(f"{one.component} {placing.standing(one)}")
+        terminal.print_json({"components": [placing.placement_object(record) for record in last.values()]})
+    for record in last.values():
+        shown.finish(f"{record.component} {placing.state_words(record)}")
     failures = [end for end in ends if isinstance(end, BaseException)]
-    # All of one kind as a rule; what can't be mended here comes first.
+    # Usually all failures are of one class. Unexpected exceptions come first: they are raised as they are.
     known = (common.Failed, RequestRefused)
     failures.sort(key=lambda failure: isinstance(failure, known))
     if len(failures) > 1 and isinstance(failures[0], known):

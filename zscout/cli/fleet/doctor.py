@@ -173,7 +173,7 @@ async def _join(seen: Evidence, fleet: Fleet) -> None:
                         await devices.ask()
                 if seen.state is not None and (told := await booked.look(client)) is not None:
                     own = time.time() - told.time
-                    seen.clocks = told.clocks | ({seen.host: own} if abs(own) > booked.CLOCKS_DIFFER else {})
+                    seen.clocks = told.clocks | ({seen.host: own} if abs(own) > booked.MAX_CLOCK_DIFFERENCE_S else {})
                 with suppress(TimeoutError):
                     async with asyncio.timeout(RELAY if fleet.mesh.site is not None else 0):
                         while not client.mesh.relays():  # noqa: ASYNC110 - nothing tells

@@ -1,7 +1,7 @@
 """`zscout drain` and `uncordon`: empty a host of components and holds, use it again.
 
-A host is drained by maintenance of all its devices that lasts until it is cancelled: nodes keep it as they keep
-bookings, and the placer cordons the host for as long."""
+Draining books maintenance of all devices of the host, until it is cancelled. Nodes store it like other bookings, and
+the placer cordons the host for as long."""
 
 from __future__ import annotations
 
@@ -31,7 +31,11 @@ from zscout.terminal import clean, clock
 from zscout.types import Grant
 
 OLDER: Final = "the leader is of an older version"
-CANT: Final = {"wrong_strategy": 'only strategy "adaptive" drains them', "bad_request": OLDER, "bad_name": OLDER}
+CANNOT_DRAIN: Final = {
+    "wrong_strategy": 'only strategy "adaptive" drains them',
+    "bad_request": OLDER,
+    "bad_name": OLDER,
+}
 """Why a leader can't drain devices, by the code of its refusal."""
 
 
@@ -59,14 +63,14 @@ async def drain(host: str, wait: bool, now: bool, timeout: float | None, comment
       zscout drain anvil --now --comment 'new disk'
       zscout drain anvil --timeout 2m
     """
-    cordoned = f"{host} stays cordoned; to use it again: zscout uncordon {host}"
+    stays_cordoned = f"{host} stays cordoned; to use it again: zscout uncordon {host}"
     async with placing.connected("drain", as_json=as_json) as (client, shown, placer):
         leftovers = _Leftovers(client, placer, host)
         at_first = {placement.component for placement in leftovers.components()}
-        waits = wait or now or timeout is not None
+        waits_for_holds = wait or now or timeout is not None
 
         def late() -> str:
-            return f"{host} is not empty after {terminal.span(timeout or 0)}: {leftovers.words()}; {cordoned}"
+            return f"{host} is not empty after {terminal.span(timeout or 0)}: {leftovers.words()}; {stays_cordoned}"
 
         def revoked(_key: str, grants: Grants) -> None:
             if grants.revoked:
@@ -75,8 +79,8 @@ async def drain(host: str, wait: bool, now: bool, timeout: float | None, comment
         granted = await _close(client, placer, host, urgent=now, comment=comment)
         with closing(client.mesh.subscribe(client.mesh.keys.grants, Grants, revoked)):
             await leftovers.look()
-            async with shown.within(timeout, late, cordoned):
-                while leftovers.leaving() or (waits and leftovers.holds):
+            async with shown.within(timeout, late, stays_cordoned):
+                while leftovers.leaving() or (waits_for_holds and leftovers.holds):
                     shown.update(f"{host}: {leftovers.words()}")
                     await placer.wait_changed()
                     await leftovers.look()
@@ -88,13 +92,13 @@ async def drain(host: str, wait: bool, now: bool, timeout: float | None, comment
         held = [hold_json(hold) | {"rcs": leftovers.rcs_of(hold)} for hold in holds]
         terminal.print_json({"host": host, "moved": went, "stay": stays, "held": held})
     for record in moved:
-        shown.say(f"{record.component} went to {record.host}{placing.out_of_work(record)}")
+        shown.finish(f"{record.component} went to {record.host}{placing.out_of_work(record)}")
     if stay or holds:
         ends = ["end them with zscout component stop"] if stay else []
         ends += ["wait for holds with --wait, or end them with --now"] if holds and not granted else []
-        raise common.Failed("; ".join((f"{host} is not empty: {leftovers.words()}", *ends, cordoned)))
+        raise common.Failed("; ".join((f"{host} is not empty: {leftovers.words()}", *ends, stays_cordoned)))
     still = f"; its devices are still granted: {granted}" if granted and leftovers.rcs else ""
-    shown.say(f"{host} is empty{still}; {cordoned}")
+    shown.finish(f"{host} is empty{still}; {stays_cordoned}")
 
 
 @click.command()
@@ -112,11 +116,11 @@ async def uncordon(host: str, as_json: bool) -> None:
         if host not in placer.cordoned:
             for line in await placing.absent(placer.mesh, [host]):
                 terminal.print_line(f"zscout: {line}", sys.stderr)
-        told, bookings = await ask_bookings(client), BookingsClient(client)
+        bookings_list, bookings_client = await ask_bookings(client), BookingsClient(client)
         try:
-            for booking, date in maintenance_of(told, host):
+            for booking, date in maintenance_of(bookings_list, host):
                 if len(booking.needs) == 1:
-                    await bookings.unbook(booking.id, date.start if booking.every else None)
+                    await bookings_client.unbook(booking.id, date.start if booking.every else None)
             uncordoned = await placer.request(UncordonHost(host), Placements)
         except RequestRefused as refused:
             raise explained(refused) from None
@@ -127,21 +131,21 @@ async def uncordon(host: str, as_json: bool) -> None:
 
 
 async def _close(client: Client, placer: PlacerClient, host: str, *, urgent: bool, comment: str) -> str:
-    """Put the host in maintenance until that is cancelled. Where the leader can't, only components leave, and it
-    returns why. Raises Failed, RequestRefused."""
-    told, me, bookings = await ask_bookings(client), User.of(client), BookingsClient(client)
-    drains = [booking for booking, _ in maintenance_of(told, host) if booking.lasting]
+    """Book maintenance of the host until it is cancelled. If the leader can't, cordon the host for components alone
+    and return the reason; otherwise return "". Raises Failed, RequestRefused."""
+    known, me, bookings_client = await ask_bookings(client), User.of(client), BookingsClient(client)
+    drains = [booking for booking, _ in maintenance_of(known, host) if booking.lasting]
     is_drained = any(booking.urgent or not urgent for booking in drains)
     try:
         if not is_drained:
             await _check_host(client, placer, host)
-            # The name of the booking says all.
+            # The name of the booking is enough.
             client.who = replace(client.who or Who(), command="")
-            await bookings.book(
+            await bookings_client.book(
                 {of_host(host): {}},
-                datetime.fromtimestamp(int(told.time), UTC),
+                datetime.fromtimestamp(int(known.time), UTC),
                 WINDOW,
-                name=free_name(f"drain-{host}"[:MAX_NAMED], [own for own in told.bookings if is_own(own, me)]),
+                name=free_name(f"drain-{host}"[:MAX_NAMED], [own for own in known.bookings if is_own(own, me)]),
                 priority=MAX_PRIORITY,
                 maintenance=True,
                 urgent=urgent,
@@ -149,18 +153,18 @@ async def _close(client: Client, placer: PlacerClient, host: str, *, urgent: boo
                 comment=comment,
             )
             for booking in drains:
-                await bookings.unbook(booking.id)
+                await bookings_client.unbook(booking.id)
         await placer.refresh()
     except RequestRefused as refused:
-        if refused.code not in CANT:
+        if refused.code not in CANNOT_DRAIN:
             raise explained(refused) from None
         placer.take(*(await placer.request(DrainHost(host), Placements)).components)
-        return CANT[refused.code]
+        return CANNOT_DRAIN[refused.code]
     return ""
 
 
 async def _check_host(client: Client, placer: PlacerClient, host: str) -> None:
-    """Raises Failed for a host that is neither on the mesh nor known by a device or a component."""
+    """Raises Failed if the host is not on the mesh, and no device or component names it."""
     state = await common.state_of(client)
     if host not in {view.host for view in state.rcs} | {known.host for known in placer.placements.values()}:
         for line in await placing.absent(placer.mesh, [host]):
@@ -168,7 +172,7 @@ async def _check_host(client: Client, placer: PlacerClient, host: str) -> None:
 
 
 class _Leftovers:
-    """The components and holds that are left on a host."""
+    """The components and holds left on a host."""
 
     def __init__(self, client: Client, placer: PlacerClient, host: str) -> None:
         self._client, self._placer, self._host = client, placer, host
@@ -177,13 +181,13 @@ class _Leftovers:
         self._until: dict[Grant, str] = {}
 
     async def look(self) -> None:
-        """Ask the leader for the holds; without an answer they remain as they were."""
+        """Ask the leader for the holds; without an answer keep the last known ones."""
         if (state := await self._client.state()) is None:
             return
         self.rcs = {view.rc for view in state.rcs if view.host == self._host}
         self.holds = [hold for hold in state.holds if self.rcs & hold.needs.keys()]
         for hold in self.holds:
-            # Always the same words for one end: in a pipe each change is a line.
+            # Compute the words for an end once: in a pipe each changed line is printed.
             if hold.remaining > 0:
                 self._until.setdefault(hold.grant, f" until {clock(hold.remaining)} at the latest")
 
@@ -196,7 +200,7 @@ class _Leftovers:
         return [known for known in here if known.state not in placing.OVER]
 
     def leaving(self) -> list[Placement]:
-        """A component that does not run yet is moved when it does."""
+        """Return the components that will leave; one that does not run yet is moved as soon as it runs."""
         return [known for known in self.components() if known.movable or known.state != "running"]
 
     def words(self) -> str:
@@ -211,4 +215,4 @@ class _Leftovers:
 def _component_words(placement: Placement) -> str:
     why = placement.reason or ("" if placement.movable else "it can't be moved")
     stays = "stays" + (f" ({why})" if why else "")
-    return f"{placement.component} {stays if placement.state == 'running' else placing.standing(placement)}"
+    return f"{placement.component} {stays if placement.state == 'running' else placing.state_words(placement)}"
