@@ -190,7 +190,7 @@ async def test_a_holder_reports_its_device_broken_and_only_operators_get_it_unti
     none = await lab.zscout("maintain", "robot/a", "--well")
     assert (none.returncode, none.stderr) == (
         1,
-        "zscout: nobody has reported robot/a broken; see zscout booking list\n",
+        "zscout: no report that robot/a is broken; see zscout booking list\n",
     )
 
 

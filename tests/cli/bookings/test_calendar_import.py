@@ -11,7 +11,7 @@ import pytest
 from msgspec.structs import asdict
 
 from zscout.cli.bookings import calendar
-from zscout.cli.bookings.calendar import AT_ONCE, _Import
+from zscout.cli.bookings.calendar import CONCURRENT_BOOKINGS, _Import
 from zscout.cli.bookings.calendar_plan import ImportPlan, Wanted
 from zscout.messages import Book, BookingView
 
@@ -55,18 +55,21 @@ def importing(leader: Leader, number: int, monkeypatch: pytest.MonkeyPatch) -> t
 async def test_events_are_booked_several_at_a_time_and_told_in_their_order(monkeypatch: pytest.MonkeyPatch) -> None:
     work, plan = importing(leader := Leader(100), 20, monkeypatch)
     await work._run(plan, sync=False)
-    assert (leader.most, [row.title for row in work.rows]) == (AT_ONCE, [wanted.title for wanted in plan.wanted])
+    assert (leader.most, [row.title for row in work.rows]) == (
+        CONCURRENT_BOOKINGS,
+        [wanted.title for wanted in plan.wanted],
+    )
     assert {row.result for row in work.rows} == {"booked"}
 
 
 async def test_an_import_that_is_interrupted_says_what_stays(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    work, plan = importing(leader := Leader(AT_ONCE), 20, monkeypatch)
+    work, plan = importing(leader := Leader(CONCURRENT_BOOKINGS), 20, monkeypatch)
     task = asyncio.create_task(work.run(plan, sync=False))
-    while len(leader.asked) <= AT_ONCE:  # noqa: ASYNC110
+    while len(leader.asked) <= CONCURRENT_BOOKINGS:  # noqa: ASYNC110
         await asyncio.sleep(0.001)
     task.cancel()
     with pytest.raises(asyncio.CancelledError):
         await task
-    assert capsys.readouterr().err.startswith(f"{AT_ONCE} of 20 events imported, which stay booked; ")
+    assert capsys.readouterr().err.startswith(f"{CONCURRENT_BOOKINGS} of 20 events imported, which stay booked; ")

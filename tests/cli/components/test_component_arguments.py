@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from zscout.cli.components.logs import last
-from zscout.cli.components.placing import standing, tail_of, unknown
+from zscout.cli.components.placing import state_words, tail_of, unknown
 from zscout.cli.components.start import gather_params, parse_size
 from zscout.config.strict import BadInput
 from zscout.messages import ComponentSpec, Placement
@@ -56,7 +56,7 @@ def test_how_a_component_stands_in_words() -> None:
     spec = ComponentSpec("counter")
 
     def words(state: str, **more: object) -> str:
-        return standing(Placement("c", spec, state, **more))  # type: ignore[arg-type]
+        return state_words(Placement("c", spec, state, **more))  # type: ignore[arg-type]
 
     assert words("running", host="anvil", reason="best of 3") == "runs on anvil"
     assert words("waiting", reason="no host has gpu") == "waits for a host: no host has gpu"

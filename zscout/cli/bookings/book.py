@@ -1,4 +1,4 @@
-"""`zscout book` and `zscout maintain`: devices together, from a date on."""
+"""`zscout book` and `zscout maintain`: reserve devices together from a date on."""
 
 from __future__ import annotations
 
@@ -60,23 +60,23 @@ from zscout.services.bookings.dates import dates
 from zscout.terminal import clean, many, span
 
 DAY: Final = 86_400
-A_YEAR: Final = MAX_AHEAD - 25 * 3600
-"""Seconds after which a day begins that is over before the longest time: one has 25 hours."""
-LOOK_AHEAD: Final = 7 * DAY
-"""Seconds in which other times are sought where one is not free."""
-OTHERS: Final = 3
+LAST_DAY_AHEAD_S: Final = MAX_AHEAD - 25 * 3600
+"""A day that begins this far ahead ends within MAX_AHEAD: with a change of clocks a day has 25 hours."""
+LOOK_AHEAD_S: Final = 7 * DAY
+"""Search this far ahead for other times if the date is not free."""
+MAX_SUGGESTIONS: Final = 3
 MAX_REMARKS: Final = 4
 DATE: Final = Parsed("date", parse_date)
 DURATION: Final = Parsed("duration", parse_duration)
 
 
-def _maintained(text: str, _option: str) -> str:
-    """A device, a pattern, or a host, which has no kind before it."""
+def _parse_maintained(text: str, _option: str) -> str:
+    """Parse a device, a pattern, or a host, which has no kind before its name."""
     return check_need(text) if "/" in text else of_host(check_name(text, "host"))
 
 
 def date_options(command: F, *, required: bool = True) -> F:
-    """When, for how long and how often; and what both commands have besides."""
+    """Add the options that `book` and `maintain` share."""
     for option in (
         common.json_option("Print one JSON object."),
         click.option("--comment", type=Parsed("text", parse_comment), default="", help="A comment shown to others."),
@@ -86,8 +86,8 @@ def date_options(command: F, *, required: bool = True) -> F:
         zone_option,
         click.option("--until", type=DATE, help="Last day or date of the repetition. Default: a year ahead."),
         click.option("--every", type=Parsed("days", parse_every), help=f"Repeat it at the same hour: {EVERY_FORMS}."),
-        click.option("--for", "runtime", type=DURATION, required=required, help="For how long: 90s, 5m, 2h, 1d12h."),
-        click.option("--at", type=DATE, required=required, help=f"When: {DATE_FORMS}."),
+        click.option("--for", "runtime", type=DURATION, required=required, help="Length: 90s, 5m, 2h, 1d12h."),
+        click.option("--at", type=DATE, required=required, help=f"Begin: {DATE_FORMS}."),
     ):
         command = option(command)
     return command
@@ -122,14 +122,14 @@ async def book(needs: Any, priority: int, patience: Decimal | None, **rest: Any)
     """Book devices together for a date.
 
     A DEVICE is written as for `zscout request`. Before the booking no request of equal or lower priority starts on the
-    devices unless it will be over by the date, or will yield. `zscout request --booking NAME -- COMMAND` uses the
-    booking: run it at its date or earlier, when it waits; it then holds the devices until the booking's end. A
+    devices unless it will end by the date, or will yield. `zscout request --booking NAME -- COMMAND` uses the
+    booking: run it at the date, or earlier and it waits; it then holds the devices until the booking ends. A
     booking that no request uses lapses.
 
     A date without a zone is in the zone of this host; a repeated booking keeps its hour over summer time. A local
     time that occurs twice is the first; a local time that does not exist moves an hour later, with a note.
 
-    If the devices are not free, it prints why, and when they are free instead (exit code 1).
+    If the devices are not free, the command prints the reason and free times (exit code 1).
 
     \b
     Examples:
@@ -145,7 +145,7 @@ async def book(needs: Any, priority: int, patience: Decimal | None, **rest: Any)
     "needs",
     nargs=-1,
     required=True,
-    type=Parsed("need", _maintained),
+    type=Parsed("need", _parse_maintained),
     metavar="DEVICE|HOST...",
     shell_complete=completion.maintained,
 )
@@ -163,15 +163,14 @@ async def maintain(needs: Sequence[str], yes: bool, broken: str | None, well: bo
     """Reserve devices for maintenance, as an operator: a drain with a date.
 
     A pattern means all devices that match it, a HOST all its devices; the host gets no components meanwhile.
-    Maintenance is a booking at the fleet's operator priority that no request can use. Requests that would not be over
-    by its date do not start on the devices; requests that wait are shown until when. `zscout booking cancel` ends it
-    early.
+    Maintenance is a booking at the fleet's operator priority that no request can use. Requests that would not end
+    by its date do not start on the devices; waiting requests show its end. `zscout booking cancel` ends it early.
 
-    --broken REASON reports devices broken, from now on: holds go on, and the devices are granted to operators only
-    until --well. In a secured fleet an operator may report any device, others those that they hold.
+    --broken REASON reports devices broken from now on: holds continue, and the devices are granted to operators only
+    until --well. In a secured fleet an operator may report any device, other users the devices that they hold.
 
-    It prints whom it displaces, holds and bookings, and asks on stderr; if stdin is not a terminal, add --yes (exit
-    code 2).
+    The command lists the holds and bookings that maintenance displaces, and asks on stderr; if stdin is not a
+    terminal, add --yes (exit code 2).
 
     \b
     Examples:
@@ -212,11 +211,11 @@ async def _report(needs: Sequence[str], broken: str | None, *, well: bool, as_js
             if broken:
                 reported = [await bookings.report_broken(needs, broken)]
             else:
-                told = await ask_bookings(client)
+                answer = await ask_bookings(client)
                 wanted = {*needs}
-                reported = [one for one in reports(told) if wanted & {*one.needs, *one.maintained}]
+                reported = [report for report in reports(answer) if wanted & {*report.needs, *report.maintained}]
                 if not reported:
-                    raise Failed(f"nobody has reported {', '.join(needs)} broken; see zscout booking list")
+                    raise Failed(f"no report that {', '.join(needs)} is broken; see zscout booking list")
                 reported = [await bookings.unbook(report.id) for report in reported]
         except RequestRefused as refused:
             raise explained(refused) from None
@@ -231,7 +230,7 @@ async def _report(needs: Sequence[str], broken: str | None, *, well: bool, as_js
 
 @dataclass(frozen=True, slots=True)
 class Asked:
-    """When it is to be, by the fleet's time. `last`: of what is repeated, nothing begins after."""
+    """The dates asked for, by fleet time. `last`: end of the repetition."""
 
     start: Found
     every: int
@@ -250,7 +249,8 @@ class Asked:
         now: float,
         late: float = 0.0,
     ) -> Asked:
-        """What has begun can be taken up for `late` seconds yet. Raises BadInput."""
+        """Check the options. `late`: seconds after its start within which a date can still be booked. Raises
+        BadInput."""
         start, last = at.found(now, zone), None
         begins = start.at.timestamp()
         if begins + late <= now:
@@ -261,7 +261,7 @@ class Asked:
             return cls(start, 0, None, runtime, zone)
         if not start.exists:
             raise BadInput(f"--at: {start.note}, and every repetition would; begin with another date")
-        latest = last = _end_of(in_zone(now + A_YEAR, zone).date(), zone)
+        latest = last = _end_of(in_zone(now + LAST_DAY_AHEAD_S, zone).date(), zone)
         if until is not None:
             day = until.whole_day(now, zone)
             last = until.found(now, zone).at if day is None else _end_of(day, zone)
@@ -272,7 +272,7 @@ class Asked:
         return cls(start, every, last, runtime, zone)
 
     def remarks(self) -> list[str]:
-        """What was taken of hours that do not exist, or come twice."""
+        """Return the notes on hours that do not exist or come twice."""
         if not self.every:
             return [self.start.note] if self.start.note else []
         found = dates(self._record(), 0, self.start.at.timestamp() + MAX_AHEAD)
@@ -281,7 +281,7 @@ class Asked:
         return [*notes[:MAX_REMARKS], f"and {more} more like that"] if more > 0 else notes
 
     def spans(self, now: float) -> list[tuple[float, float]]:
-        """Its dates within 60 days."""
+        """Return (begin, end) of its dates within 60 days."""
         first, length = int(self.start.at.timestamp()), float(self.runtime)
         starts = dates(self._record(), now - length, now + WINDOW) if self.every else [first]
         return [(start, start + length) for start in starts or [first]]
@@ -313,7 +313,7 @@ async def _make(
     as_json: bool,
 ) -> None:
     zone = zone or host_zone()
-    # What is wrong in any case is said before the mesh is joined.
+    # Report errors that need no fleet before joining the mesh.
     at.found(clocks.time(), zone)
     if until is not None and every is None:
         raise BadInput("--until ends a repeated booking; add --every, or leave --until out")
@@ -321,16 +321,16 @@ async def _make(
         raise BadInput(f"--patience is longer than the booking; write at most {span(float(runtime))}")
     name = check_new_name(name, "--name") if name is not None else None
     async with common.connected("maintain" if maintenance else "book") as client:
-        # Others are told its name, and not by which command it was made.
+        # Other users see the name of the booking, not the command that made it.
         client.who = replace(client.who or Who(), command="")
-        told, me = await ask_bookings(client), User.of(client)
+        answer, me = await ask_bookings(client), User.of(client)
         late = min(runtime, Decimal(PATIENCE) if patience is None else patience)
-        asked = Asked.of(at, runtime, every, until, zone, told.time, float(late))
-        own = [booking for booking in told.bookings if is_own(booking, me)]
+        asked = Asked.of(at, runtime, every, until, zone, answer.time, float(late))
+        own = [booking for booking in answer.bookings if is_own(booking, me)]
         default = "maintenance" if maintenance else _named_after(needs)
         displaced = {}
         if maintenance:
-            cost = await _displaced(client, needs, asked, priority, told)
+            cost = await _displaced(client, needs, asked, priority, answer)
             await cost.agree(name or default, yes=yes)
             displaced = {"displaced": cost.as_json()}
         terms: dict[str, Any] = {"priority": priority, "comment": comment}
@@ -349,18 +349,18 @@ async def _make(
         except RequestRefused as refused:
             if refused.code != "not_free":
                 raise explained(refused) from None
-            raise Failed(await _instead(client, refused, needs, asked, priority)) from None
-        twice = any(one.name == booking.name and one.id != booking.id for one in own)
+            raise Failed(await _not_free(client, refused, needs, asked, priority)) from None
+        twice = any(other.name == booking.name and other.id != booking.id for other in own)
         if as_json:
             terminal.print_json(booking_json(booking, me) | {"remarks": asked.remarks()} | displaced)
             return
-        _print(booking, asked, told)
+        _print(booking, asked, answer)
         if twice:
             terminal.print_line(f"you have another booking called {booking.name}: name it by its id, {short(booking)}")
 
 
-async def _displaced(client: Client, needs: Needs, asked: Asked, priority: int, told: BookingsTold) -> Displaced:
-    """Whom maintenance displaces. Raises BadInput for an unknown host."""
+async def _displaced(client: Client, needs: Needs, asked: Asked, priority: int, answer: BookingsTold) -> Displaced:
+    """Return the holds and bookings that maintenance displaces. Raises BadInput for an unknown host."""
     state = await common.state_of(client)
     hosts = {view.host for view in state.rcs if view.host}
     for host in filter(None, map(host_in, needs)):
@@ -369,7 +369,7 @@ async def _displaced(client: Client, needs: Needs, asked: Asked, priority: int, 
             raise BadInput(
                 f"unknown host {quoted(host)}{common.hint_at(host, names, 'and there are none', 'there are')}"
             )
-    return Displaced(needs, asked.spans(told.time), priority, state, told)
+    return Displaced(needs, asked.spans(answer.time), priority, state, answer)
 
 
 def _named_after(needs: Needs) -> str:
@@ -378,39 +378,40 @@ def _named_after(needs: Needs) -> str:
     return "booking" if is_pattern(kind) else valid_name(kind if is_pattern(name) else f"{kind}-{name}")[:MAX_NAMED]
 
 
-async def _instead(client: Client, refused: RequestRefused, needs: Needs, asked: Asked, priority: int) -> str:
+async def _not_free(client: Client, refused: RequestRefused, needs: Needs, asked: Asked, priority: int) -> str:
+    """Return the error line with free times."""
     start = asked.start.at
     try:
-        how: dict[str, Any] = {"start": start, "priority": priority, "limit": OTHERS}
-        told = await BookingsClient(client).slots(needs, asked.runtime, LOOK_AHEAD, **how)
+        how: dict[str, Any] = {"start": start, "priority": priority, "limit": MAX_SUGGESTIONS}
+        answer = await BookingsClient(client).slots(needs, asked.runtime, LOOK_AHEAD_S, **how)
     except RequestRefused:
-        return f"{refused}; zscout slots tells when they are free"
-    free = [date_words(slot.start, asked.zone) for slot in told.slots if slot.start > start.timestamp()]
+        return f"{refused}; zscout slots lists free times"
+    free = [date_words(slot.start, asked.zone) for slot in answer.slots if slot.start > start.timestamp()]
     if not free:
-        return f"{refused}; within {span(LOOK_AHEAD)} after that they are not free together"
-    alone = "that date alone is free" if asked.every else "free together"
-    return f"{refused}; {alone} from {' or '.join(free)} on ({asked.zone.key}): write another --at"
+        return f"{refused}; in the {span(LOOK_AHEAD_S)} after it they are never free together"
+    first = "the first date alone is free" if asked.every else "free together"
+    return f"{refused}; {first} from {' or '.join(free)} on ({asked.zone.key}): write another --at"
 
 
-def _print(booking: BookingView, asked: Asked, told: BookingsTold) -> None:
+def _print(booking: BookingView, asked: Asked, answer: BookingsTold) -> None:
     first, zone = next(iter(booking.dates), None), asked.zone
     begins = asked.start.at.timestamp()
-    when = f"{span_words(begins, begins + float(asked.runtime), zone)} ({zone.key}), {in_words(begins - told.time)}"
+    when = f"{span_words(begins, begins + float(asked.runtime), zone)} ({zone.key}), {in_words(begins - answer.time)}"
     done = "" if booking.maintenance else " is booked"
     terminal.print_line(clean(f"{booking.name} ({short(booking)}){done}: {rcs_words(booking, first)}: {when}"))
     if booking.every:
         last = "" if booking.until is None else f" until {in_zone(booking.until, zone):%a %Y-%m-%d}"
         soon = many(len(booking.dates), "date")
-        terminal.print_line(f"it is repeated {every_words(booking.every)}{last}: {soon} within 60 days")
+        terminal.print_line(f"repeated {every_words(booking.every)}{last}: {soon} within 60 days")
     for note in asked.remarks():
         terminal.print_line(note)
-    for one in booking.dates:
-        if one.danger or one.state == "conflict":
-            text = f"{when_words(booking, one, zone)}: {state_words(booking, one)}"
+    for booked in booking.dates:
+        if booked.danger or booked.state == "conflict":
+            text = f"{when_words(booking, booked, zone)}: {state_words(booking, booked)}"
             click.secho(clean(text), fg="yellow")
     if booking.maintenance:
         terminal.print_line(f"to end it early: zscout booking cancel {bounded(booking.name)}")
     else:
         within = span(float(booking.patience))
         take_up = f"zscout request --booking {bounded(booking.name)} -- COMMAND"
-        terminal.print_line(f"take it up before, or within {within} of its date: {take_up}")
+        terminal.print_line(f"to use it, start before its date or within {within} after: {take_up}")

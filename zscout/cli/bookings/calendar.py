@@ -1,4 +1,4 @@
-"""`zscout booking`: bookings as iCalendar files, and those of others as bookings."""
+"""`zscout booking export` and `import`: bookings as iCalendar files, and iCalendar events as bookings."""
 
 from __future__ import annotations
 
@@ -37,16 +37,15 @@ from zscout.services.bookings.calendar_text import CalendarSelection, calendar_t
 from zscout.terminal import Table, clean, many
 
 MAX_WORDS: Final = 200
-AT_ONCE: Final = 8
-"""Bookings that are asked for at once: hosts write those that come together to their disks in one go."""
-QUIET: Final = 1.0
-"""Seconds before a terminal shows how far it is."""
-LOOK: Final = 1.0
-"""Seconds in which RCs are seen."""
+CONCURRENT_BOOKINGS: Final = 8
+"""Bookings sent at once: a host writes bookings that arrive together to its disk in one step."""
+SHOW_PROGRESS_AFTER_S: Final = 1.0
+FIND_RCS_S: Final = 1.0
+"""Within this time the tokens of all RCs are seen."""
 _NEXT_NEED: Final = re.compile(r",(?=[^,=]*/)")
 
 
-# Out
+# Export
 
 
 @click.command()
@@ -56,15 +55,15 @@ _NEXT_NEED: Final = re.compile(r",(?=[^,=]*/)")
     shell_complete=completion.needs,
     help="Only bookings of this device.",
 )
-@click.option("--owner", metavar="NAME", help="Only bookings of one host, or of a person by certificate.")
+@click.option("--owner", metavar="NAME", help="Only bookings of a host, or of a person by certificate.")
 @click.option("--out", metavar="FILE", help="The file to write. Default, or -: stdout.")
 @click.option("--folder", type=click.Path(path_type=Path), help="Write all calendars below this folder.")
 @common.runs
 async def export(rc: str | None, owner: str | None, out: str | None, folder: Path | None) -> None:
     """Write the bookings that are not over as an iCalendar file.
 
-    With --folder it writes fleet.ics, rc/KIND/NAME.ics for each device and owner/NAME.ics for each owner, for a web
-    server; the file of a device or owner without bookings stays, empty. Files are replaced as a whole, and only if
+    With --folder the command writes fleet.ics, rc/KIND/NAME.ics for each device and owner/NAME.ics for each owner, for
+    a web server; a device or owner without bookings keeps an empty file. Files are replaced as a whole, and only if
     bookings changed. To let calendar programs subscribe to a node, see [calendar] of the node file.
 
     \b
@@ -79,7 +78,7 @@ async def export(rc: str | None, owner: str | None, out: str | None, folder: Pat
         bookings = (await ask_bookings(client)).bookings
         rcs = set[str]()
         if folder is not None:
-            tokens = await client.mesh.living(client.mesh.keys.alive_any(Role.RC), timeout=LOOK)
+            tokens = await client.mesh.living(client.mesh.keys.alive_any(Role.RC), timeout=FIND_RCS_S)
             rcs = {token.name for token in tokens}
         fleet = client.fleet.name
     if folder is not None:
@@ -94,21 +93,21 @@ async def export(rc: str | None, owner: str | None, out: str | None, folder: Pat
 
 
 def _write_all(folder: Path, fleet: str, bookings: list[BookingView], rcs: Iterable[str]) -> tuple[int, int]:
-    """How many files are new, and how many there are. Raises Failed."""
-    bound = {rc for one in bookings for date in one.dates for rc in date.bound.values()}
-    maintained = {rc for one in bookings for rc in one.maintained}
-    named = {need for one in bookings for need in one.needs if not is_pattern(need) and host_in(need) is None}
-    selections = {CalendarSelection(), *(CalendarSelection(one.owner) for one in bookings if one.owner)}
+    """Write all calendars. Return the number of files that changed, and of all files. Raises Failed."""
+    bound = {rc for booking in bookings for date in booking.dates for rc in date.bound.values()}
+    maintained = {rc for booking in bookings for rc in booking.maintained}
+    named = {need for booking in bookings for need in booking.needs if not is_pattern(need) and host_in(need) is None}
+    selections = {CalendarSelection(), *(CalendarSelection(booking.owner) for booking in bookings if booking.owner)}
     selections |= {CalendarSelection(rc=rc) for rc in {*rcs, *bound, *named, *maintained}}
     selections |= {CalendarSelection(path.stem) for path in folder.glob("owner/*.ics")}
     selections |= {CalendarSelection(rc=f"{path.parent.name}/{path.stem}") for path in folder.glob("rc/*/*.ics")}
     # A kind may consist of dots.
-    safe = [one for one in selections if ".." not in one.path.split("/")]
-    return sum(_write(folder / one.path, calendar_text(fleet, bookings, one)) for one in safe), len(safe)
+    safe = [chosen for chosen in selections if ".." not in chosen.path.split("/")]
+    return sum(_write(folder / chosen.path, calendar_text(fleet, bookings, chosen)) for chosen in safe), len(safe)
 
 
 def _write(path: Path, text: bytes) -> bool:
-    """Whether it had to be. Raises Failed."""
+    """Write the file if its text changed; return True if it did. Raises Failed."""
     try:
         if path.exists() and not path.is_file():  # a device, a pipe
             path.write_bytes(text)
@@ -122,18 +121,19 @@ def _write(path: Path, text: bytes) -> bool:
     return True
 
 
-# In
+# Import
 
 
 def parse_needs(text: str, option: str) -> Pairs:
-    """`robot/arm1,framegrabber/*,radio/rf0:command_rate=5`; a pattern that comes again is one more. Raises BadInput."""
+    """Parse `robot/arm1,framegrabber/*,radio/rf0:command_rate=5`; a repeated pattern asks for one more device. Raises
+    BadInput."""
     if not text:
         raise BadInput(f"{option}: names no device; write one, as in robot/arm1")
-    return tuple(gather_needs([parse_need(one, option) for one in _NEXT_NEED.split(text)]).items())
+    return tuple(gather_needs([parse_need(need, option) for need in _NEXT_NEED.split(text)]).items())
 
 
-def _mapping(text: str, option: str) -> tuple[str, Pairs]:
-    """`Arm 1=robot/arm1`. Raises BadInput."""
+def _parse_mapping(text: str, option: str) -> tuple[str, Pairs]:
+    """Parse `Arm 1=robot/arm1`. Raises BadInput."""
     words, equals, needs = text.partition("=")
     if not equals or not 1 <= len(words.strip()) <= MAX_WORDS:
         raise BadInput(f"{option}: {quoted(text)} is not a mapping; write WORDS=DEVICE, as in 'Arm 1=robot/arm1'")
@@ -142,7 +142,7 @@ def _mapping(text: str, option: str) -> tuple[str, Pairs]:
 
 @dataclass(slots=True)
 class Row:
-    """What became of one booking of the calendar."""
+    """The result for one booking of the calendar."""
 
     title: str
     result: str
@@ -160,13 +160,13 @@ class _Import:
     again: bool
     rows: list[Row] = field(default_factory=list)
     makes_room: bool = False
-    """Whether something is given up, or would be, before the rest is booked."""
+    """True if bookings or dates are cancelled, or would be, before the rest is booked."""
     line: terminal.LiveLine = field(default_factory=lambda: terminal.LiveLine(sys.stderr))
     done: int = 0
-    """Events of which it is known what became of them."""
+    """Number of events processed."""
 
     async def run(self, plan: ImportPlan, *, sync: bool) -> None:
-        """Tells at a terminal how far it is, and at Ctrl-C what stays. Raises NobodyThere."""
+        """Import the plan; show the progress at a terminal, and on Ctrl-C what stays booked. Raises NobodyThere."""
         with self.line:
             try:
                 await self._run(plan, sync=sync)
@@ -174,30 +174,30 @@ class _Import:
                 self.line.hide()
                 if not self.dry_run:
                     terminal.print_line(
-                        f"{self.done} of {many(len(plan.wanted), 'event')} imported, which stay booked; "
+                        f"{self.done} of {many(len(plan.wanted), 'event')} imported; they stay booked; "
                         "import the file again for the rest: nothing is booked twice",
                         sys.stderr,
                     )
                 raise
 
     async def _run(self, plan: ImportPlan, *, sync: bool) -> None:
-        gone = [one for one in self.known if one.id.endswith(self.options.suffix) and one.id not in plan.ids]
+        gone = [view for view in self.known if view.id.endswith(self.options.suffix) and view.id not in plan.ids]
         for view in gone:
             if not view.unbooked and view.owner == self.client.mesh.me.host:
                 words = view.who.comment if view.who is not None and view.who.comment else view.name
-                if sync and any(one.failed for one in plan.skipped):
-                    self.rows.append(Row(words, "kept", "an event could not be read, and may be this one", view))
+                if sync and any(event.failed for event in plan.skipped):
+                    self.rows.append(Row(words, "kept", "an event could not be read; it may be this booking", view))
                 elif sync:
                     await self._unbook(view, words)
                 else:
-                    self.rows.append(Row(words, "kept", "it is no longer in the calendar; --sync gives it up", view))
-        by_id = {one.id: one for one in self.known if not one.unbooked}
-        wants = [(wanted, next((by_id[one] for one in wanted.ids if one in by_id), None)) for wanted in plan.wanted]
+                    self.rows.append(Row(words, "kept", "it is no longer in the calendar; --sync cancels it", view))
+        by_id = {view.id: view for view in self.known if not view.unbooked}
+        wants = [(wanted, next((by_id[id_] for id_ in wanted.ids if id_ in by_id), None)) for wanted in plan.wanted]
         began = time.monotonic()
-        # What gives up dates makes room for what comes behind it. A dry run keeps nothing that could be waited for.
+        # A booking that drops dates is sent alone: later bookings may need the room. A dry run has nothing to batch.
         for alone, some in groupby(wants, lambda item: self.dry_run or bool(item[0].dropped)):
-            while part := list(islice(some, 1 if alone else AT_ONCE)):
-                if time.monotonic() - began > QUIET:
+            while part := list(islice(some, 1 if alone else CONCURRENT_BOOKINGS)):
+                if time.monotonic() - began > SHOW_PROGRESS_AFTER_S:
                     self.line.draw(f"{self.done} of {len(wants)} events")
                 try:
                     async with asyncio.TaskGroup() as group:
@@ -217,47 +217,46 @@ class _Import:
         if known is None and wanted.book is not None:
             row.result = "would be booked" if self.dry_run else "booked"
             if self.dry_run:
-                await self._foresee(wanted.book, row)
+                await self._check_free(wanted.book, row)
                 return
             known = await self._book(wanted.ids, wanted.book, row)
         if known is None:
             return
         last = known.start if known.until is None else known.until
-        given_up = {*known.dropped, *(one.start for one in known.dates if one.state == "unbooked")}
+        given_up = {*known.dropped, *(date.start for date in known.dates if date.state == "unbooked")}
         dropped = [at for at in wanted.dropped if known.start <= at <= last and at not in given_up]
         self.makes_room |= bool(dropped)
         for at in dropped:
             if not self.dry_run:
                 await self._ask(Unbook(known.id, at, self.client.who), row)
-        row.why = row.why or (f"without {many(len(dropped), 'date')} given up in the calendar" if dropped else "")
+        row.why = row.why or (f"without {many(len(dropped), 'date')} dropped in the calendar" if dropped else "")
 
-    async def _foresee(self, book: Book, row: Row) -> None:
-        """Tells in the row why it would not be booked; of what is repeated its first date is tried. Raises
-        NobodyThere."""
+    async def _check_free(self, book: Book, row: Row) -> None:
+        """Check whether the first date is free, and write the reason in the row if not. Raises NobodyThere."""
         start = datetime.fromtimestamp(book.start, UTC)
         try:
             client = BookingsClient(self.client)
-            told = await client.slots(book.needs, book.runtime, 1.0, start=start, priority=book.priority, limit=1)
+            answer = await client.slots(book.needs, book.runtime, 1.0, start=start, priority=book.priority, limit=1)
         except RcmSilent as silent:
             raise NobodyThere(str(silent)) from None
         except RequestRefused as refused:
             row.result, row.why, row.failed = "refused", str(refused), True
             return
-        if book.maintenance or [one.start for one in told.slots] == [book.start]:
+        if book.maintenance or [slot.start for slot in answer.slots] == [book.start]:
             return
         if self.makes_room:
-            row.why = "if what is given up makes room for it"
+            row.why = "if the cancelled dates make room for it"
         else:
-            row.result, row.why, row.failed = "not free", "zscout slots tells when they are", True
+            row.result, row.why, row.failed = "not free", "zscout slots lists free times", True
 
     async def _book(self, ids: tuple[str, ...], book: Book, row: Row) -> BookingView | None:
-        """None: it is not booked, and the row tells. Raises NobodyThere."""
+        """Return the booking; None if it is not booked, with the reason in the row. Raises NobodyThere."""
         for booking in ids if self.again else ids[:1]:
             made = await self._ask(replace(book, id=booking), row)
             if made is None or not made.unbooked:
                 row.book = made or row.book
                 return made
-        row.result, row.why = "given up before", "it was unbooked since then; --again books it again"
+        row.result, row.why = "given up before", "it was cancelled after its import; --again books it again"
         return None
 
     async def _unbook(self, view: BookingView, words: str) -> None:
@@ -268,7 +267,7 @@ class _Import:
             await self._ask(Unbook(view.id, who=self.client.who), row)
 
     async def _ask(self, operation: Book | Unbook, row: Row) -> BookingView | None:
-        """None: it was refused, and the row tells. Raises NobodyThere."""
+        """Return the booking; None if refused, with the reason in the row. Raises NobodyThere."""
         try:
             return await BookingsClient(self.client).ask(operation, BookingView)
         except RcmSilent as silent:
@@ -293,7 +292,7 @@ class _Import:
     "mapped",
     multiple=True,
     metavar="WORDS=DEVICES",
-    type=Parsed("mapping", _mapping),
+    type=Parsed("mapping", _parse_mapping),
     help="Devices for events with these words in title, place or resources.",
 )
 @zone_option
@@ -322,10 +321,9 @@ async def import_(
 ) -> int:
     """Book the events of an iCalendar FILE (- is stdin), from Google, Outlook, Nextcloud and others.
 
-    --needs and --map say which devices an event needs; without either, the devices that its resources name. Other
-    events are left out, as are those that are over, cancelled, or marked as free. Importing again books nothing
-    twice; an event that changed is another booking, so use --sync then. Times without a zone, and whole days, are in
-    --zone.
+    --needs and --map give the devices of an event; without either, its resources name them. Events without devices are
+    left out, as are events that are over, cancelled, or marked as free. Importing again books nothing twice; a
+    changed event becomes another booking, so use --sync then. Times without a zone, and whole days, are in --zone.
 
     Exit code 1: an event could not be booked.
 
@@ -341,23 +339,26 @@ async def import_(
     events = read_calendar(data, "stdin" if str(file) == "-" else str(file))
     zone = zone or host_zone()
     async with common.connected("calendar") as client:
-        told = await ask_bookings(client)
+        answer = await ask_bookings(client)
         options = ImportOptions(
             client.fleet.name,
             name or file.stem,
             zone,
-            tuple(gather_needs([one for some in needs for one in some]).items()),
+            tuple(gather_needs([pair for pairs in needs for pair in pairs]).items()),
             _merged(mapped),
             client.fleet.operator_priority if maintenance else priority,
             patience,
             maintenance,
             client.who,
         )
-        plan = plan_import(events, options, told.time)
-        work = _Import(client, options, told.bookings, dry_run, again)
+        plan = plan_import(events, options, answer.time)
+        work = _Import(client, options, answer.bookings, dry_run, again)
         await work.run(plan, sync=sync)
-    rows = [*work.rows, *(Row(one.title, "not booked", one.why, failed=True) for one in plan.skipped if one.failed)]
-    left_out = Counter(one.why for one in plan.skipped if not one.failed)
+    rows = [
+        *work.rows,
+        *(Row(event.title, "not booked", event.why, failed=True) for event in plan.skipped if event.failed),
+    ]
+    left_out = Counter(event.why for event in plan.skipped if not event.failed)
     if as_json:
         terminal.print_json(
             {"fleet": options.fleet, "calendar": options.calendar, "dry_run": dry_run}

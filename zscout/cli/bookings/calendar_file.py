@@ -1,7 +1,7 @@
-"""The events of an iCalendar file. Pure; whoever wrote the file is not trusted.
+"""Read the events of an iCalendar file. Pure; the file is untrusted.
 
-Lines are unfolded, and values read, by icalendar; but only those that are used, and never a VTIMEZONE, whose rules may
-go on for ever: zones are those of the IANA database, which files name, or Windows' names for them."""
+icalendar unfolds lines and parses values, but only of the properties used here, and never a VTIMEZONE, whose rules may
+be endless: zones come from the IANA database, by their IANA or Windows names."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ from zscout.services.bookings.calendar_text import NEEDS
 from zscout.services.bookings.dates import zone_of
 
 MAX_BYTES: Final = 5_000_000
-"""Of a file."""
+"""Size of a file."""
 MAX_EVENTS: Final = 5_000
 MAX_DEPTH: Final = 8
 MAX_LINE: Final = 100_000
-"""Characters of a value that is read."""
+"""Characters of a line."""
 MAX_VALUES: Final = 1_000
-"""Lines of one name in one event, and dates in all of them."""
+"""Lines of one property in one event, and dates in all of them."""
 MAX_WORDS: Final = 200
 """Characters of a title, a place, a resource."""
 MAX_TEXTS: Final = 50
@@ -43,28 +43,28 @@ _COMMA: Final = re.compile(r"(?<!\\),")
 
 
 class Moment(NamedTuple):
-    """A date or a time as a file has it, on the clocks of `zone`; None: on those of whoever reads it."""
+    """A date or local time of a file, in `zone`; None: in the reader's zone."""
 
     local: datetime
     zone: ZoneInfo | None
     whole_day: bool = False
 
     def instant(self, zone: ZoneInfo) -> int:
-        """In whole seconds since 1970."""
+        """Return whole seconds since 1970. `zone`: the reader's."""
         return round(self.local.replace(tzinfo=self.zone or zone).timestamp())
 
 
 @dataclass(slots=True)
 class CalendarEvent:
-    """One VEVENT. `problem`: why it can't be booked, in words."""
+    """A VEVENT. `problem`: the reason that it can't be booked, in words."""
 
     uid: str = ""
     title: str = ""
     words: list[str] = field(default_factory=list)
-    """Where it may name what it needs: resources, places, its title."""
+    """Texts that may name its devices: resources, places, title."""
     resources: list[str] = field(default_factory=list)
     needs: str = ""
-    """As zscout wrote them."""
+    """Devices as zscout's own export writes them."""
     start: Moment | None = None
     end: Moment | None = None
     duration: timedelta | None = None
@@ -72,16 +72,16 @@ class CalendarEvent:
     more: list[Moment] = field(default_factory=list)
     without: list[Moment] = field(default_factory=list)
     instead_of: Moment | None = None
-    """The date of the event of this `uid` that this one is in the place of."""
+    """The date of the repeated event of this `uid` that this event replaces (RECURRENCE-ID)."""
     cancelled: bool = False
     free: bool = False
-    """Who has it in their calendar is free then."""
+    """TRANSP:TRANSPARENT: the owner of the calendar is free at this time."""
     problem: str = ""
 
 
 def read_calendar(data: bytes, source: str) -> list[CalendarEvent]:
-    """The events of a file, in its order. An event that can't be read tells so; raises BadInput for what is no calendar
-    at all, or too much of one."""
+    """Return the events of a file, in its order. An event that can't be read has a `problem`. Raises BadInput for a
+    file that is no calendar, or too large."""
     where = Where(source)
     if len(data) > MAX_BYTES:
         raise where.bad(f"has more than {MAX_BYTES:,} bytes", "export less, such as only the coming year")
@@ -98,7 +98,7 @@ def _lines(text: str) -> Contentlines:
 
 
 def _components(lines: Contentlines, where: Where) -> Iterator[dict[str, list[Contentline]]]:
-    """The lines that are read of each VEVENT. Raises BadInput."""
+    """Yield the lines of each VEVENT, by property, for the properties in READ. Raises BadInput."""
     inside: list[str] = []
     found: dict[str, list[Contentline]] = {}
     events = calendars = 0
@@ -125,14 +125,14 @@ def _components(lines: Contentlines, where: Where) -> Iterator[dict[str, list[Co
         elif inside == ["VCALENDAR", "VEVENT"] and name in READ:
             found.setdefault(name, []).append(line)
     if inside or not calendars:
-        # Half a file would look as if events had been taken out of it.
+        # In half a file events would seem to have been deleted.
         raise where.bad("ends before its END:VCALENDAR", "download or export it again")
 
 
 def _event(lines: Mapping[str, list[Contentline]]) -> CalendarEvent:
     event = CalendarEvent()
     try:
-        if any(len(some) > MAX_VALUES or any(len(one) > MAX_LINE for one in some) for some in lines.values()):
+        if any(len(some) > MAX_VALUES or any(len(line) > MAX_LINE for line in some) for some in lines.values()):
             raise ValueError("it is too long")
         values = {name: [_parts(line) for line in some] for name, some in lines.items()}
         _read_words(event, values)
@@ -197,10 +197,10 @@ def _read_dates(event: CalendarEvent, values: _Values) -> None:
 
 def _moments(values: list[tuple[Mapping[str, Any], str]]) -> list[Moment]:
     """Raises ValueError."""
-    found = [(params, one) for params, value in values for one in value.split(",")]
+    found = [(params, text) for params, value in values for text in value.split(",")]
     if len(found) > MAX_VALUES:
         raise ValueError(f"it has more than {MAX_VALUES} dates")
-    return [_moment(params, one.strip()) for params, one in found]
+    return [_moment(params, text.strip()) for params, text in found]
 
 
 def _moment(params: Mapping[str, Any], value: str) -> Moment:
@@ -217,7 +217,7 @@ def _moment(params: Mapping[str, Any], value: str) -> Moment:
 
 
 def _zone(named: str) -> ZoneInfo:
-    """Raises ValueError. Some write the way to it before its name: `/example.org/20260101/Europe/Berlin`."""
+    """Find a zone by its TZID, which may have a prefix: `/example.org/20260101/Europe/Berlin`. Raises ValueError."""
     name = named.strip().strip('"')
     parts = WINDOWS_TO_OLSON.get(name, name).strip("/").split("/")
     for count in (len(parts), 3, 2, 1):

@@ -1,9 +1,9 @@
-"""What is to be booked of a calendar's events. Pure: the same events and options give the same ids, so that what was
-imported is known again.
+"""Plan the bookings for a calendar's events. Pure: the same events and options give the same ids, so a second import
+recognizes what it imported before.
 
-A booking is repeated by a number of days: an event on two weekdays is two bookings, and each date of one that is
-monthly or yearly is one. Nothing is booked more than a year ahead, and many events have no end: so what is repeated is
-booked by half years, each once all of it is within a year."""
+A booking repeats every n days: an event on two weekdays becomes two bookings, and a monthly or yearly event a booking
+for each date. Nothing is booked more than a year ahead, and many events have no end: repeated events are booked in
+half years, each as soon as all of it is within a year."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ from zscout.keyexpr import BadName, check_maintained, check_need, host_in, valid
 from zscout.messages import MAX_AHEAD, MAX_BOOKINGS, MAX_COMMENT, Book, Instant, Who
 from zscout.services.bookings.dates import DAY
 
-TIMES: Final = 8
-"""That one event is booked again after it was given up, at most."""
-LOOK_BACK: Final = 31 * DAY
-"""Seconds: what began so long ago may not be over yet."""
+MAX_TIMES_BOOKED: Final = 8
+"""How often one event is booked: again with --again after each cancellation."""
+LOOK_BACK_S: Final = 31 * DAY
+"""Events that began this long ago may not be over yet."""
 OVER, FREE, CANCELLED = "over, or begun", "of people who are free then", "cancelled"
 NO_RC = "naming no device"
 NO_DATE = "without a date to come"
@@ -44,15 +44,15 @@ Pairs = tuple[tuple[str, dict[str, Decimal]], ...]
 
 @dataclass(frozen=True, slots=True)
 class ImportOptions:
-    """`calendar`: its name, by which what was imported from it is known again. `zone`: of times that have none."""
+    """Options of an import. `calendar`: its name, part of the ids. `zone`: for times without a zone."""
 
     fleet: str
     calendar: str
     zone: ZoneInfo
     needs: Pairs = ()
-    """Of all events."""
+    """Devices of every event."""
     mapped: Mapping[str, Pairs] = field(default_factory=dict)
-    """Of events that have these words in their title, place or resources."""
+    """Devices of events with these words in title, place or resources."""
     priority: int = 0
     patience: Decimal | None = None
     maintenance: bool = False
@@ -60,14 +60,14 @@ class ImportOptions:
 
     @property
     def suffix(self) -> str:
-        """How all ids end: people name bookings by how they begin."""
+        """The end of all ids of this calendar; their beginnings differ, since users name bookings by them."""
         return _hashed([self.fleet, self.calendar], 12)
 
 
 @dataclass(frozen=True, slots=True)
 class Wanted:
-    """A booking of the calendar, by the first of its `ids`: one that was given up is never booked again, and the next
-    is taken. `book` is None where nothing of it is left. `dropped`: dates of it to come on which it is not."""
+    """A booking of the calendar. It uses the first of its `ids` that was not cancelled: a cancelled id can't be booked
+    again. `book`: None if all its dates are dropped. `dropped`: coming dates without the event."""
 
     ids: tuple[str, ...]
     title: str
@@ -77,7 +77,7 @@ class Wanted:
 
 @dataclass(frozen=True, slots=True)
 class Skipped:
-    """`failed`: it is about RCs and should have been booked."""
+    """An event that is not booked. `failed`: it needs RCs and should have been booked."""
 
     title: str
     why: str
@@ -87,14 +87,14 @@ class Skipped:
 @dataclass(slots=True)
 class ImportPlan:
     wanted: list[Wanted] = field(default_factory=list)
-    """What is repeated comes first: what is in the place of a date of it is free once that is given up."""
+    """Repeated bookings first: an event that replaces one of their dates is free once that date is dropped."""
     skipped: list[Skipped] = field(default_factory=list)
     ids: set[str] = field(default_factory=set)
-    """Of all that is in the calendar, if it is over or begun as well."""
+    """Ids of all events of the calendar, also of events that are over or have begun."""
 
 
 def plan_import(events: Iterable[CalendarEvent], options: ImportOptions, now: float) -> ImportPlan:
-    """What to book at `now`, in seconds since 1970. Raises BadInput for too much."""
+    """Plan the bookings at `now`, in seconds since 1970. Raises BadInput for too many."""
     events = list(events)
     moved: dict[str, set[Instant]] = defaultdict(set)
     for event in events:
@@ -112,12 +112,12 @@ def plan_import(events: Iterable[CalendarEvent], options: ImportOptions, now: fl
                 plan.skipped.append(Skipped(title, NO_RC))
             else:
                 others = moved[event.uid] if event.instead_of is None else set[Instant]()
-                _Planned(plan, event, title, needs, options, now).add(others)
+                _EventPlanner(plan, event, title, needs, options, now).add(others)
         except (ValueError, OverflowError, BadInput) as error:
             plan.skipped.append(Skipped(title, str(error), failed=True))
         if len(plan.wanted) > MAX_BOOKINGS:
             raise BadInput(f"the calendar would make more than {MAX_BOOKINGS} bookings; export less of it")
-    plan.wanted.sort(key=lambda one: one.book is not None and not one.book.every)
+    plan.wanted.sort(key=lambda wanted: wanted.book is not None and not wanted.book.every)
     return plan
 
 
@@ -126,11 +126,11 @@ def _not_booked(event: CalendarEvent) -> str:
 
 
 def _needs(event: CalendarEvent, options: ImportOptions) -> Needs:
-    """What the options say of an event; where they say nothing, the RCs that it names itself. Raises BadInput."""
+    """Return the needs that the options give an event, else the RCs that it names itself. Raises BadInput."""
     pairs = [*options.needs]
     for words, needs in options.mapped.items():
-        said = re.compile(rf"(?<!\w){re.escape(words)}(?!\w)", re.IGNORECASE)
-        if any(said.search(text) for text in event.words):
+        pattern = re.compile(rf"(?<!\w){re.escape(words)}(?!\w)", re.IGNORECASE)
+        if any(pattern.search(text) for text in event.words):
             pairs += needs
     if not pairs:
         named = event.needs.split() or [text for text in event.resources if _is_need(text)]
@@ -139,7 +139,7 @@ def _needs(event: CalendarEvent, options: ImportOptions) -> Needs:
 
 
 def _host(text: str) -> tuple[str, dict[str, Decimal]]:
-    """All devices of a host. Raises BadInput."""
+    """Parse `@HOST`, all devices of a host. Raises BadInput."""
     try:
         return check_maintained(text), {}
     except BadName as error:
@@ -153,8 +153,8 @@ def _is_need(text: str) -> bool:
         return False
 
 
-class _Planned:
-    """The bookings of one event."""
+class _EventPlanner:
+    """Plans the bookings of one event."""
 
     def __init__(
         self, plan: ImportPlan, event: CalendarEvent, title: str, needs: Needs, options: ImportOptions, now: float
@@ -170,8 +170,8 @@ class _Planned:
     def add(self, moved: set[Instant]) -> None:
         """Raises ValueError."""
         event = self._event
-        given_up = moved | {self._instant(one) for one in event.without}
-        single: set[Instant] = {self._instant(one) for one in event.more}
+        given_up = moved | {self._instant(moment) for moment in event.without}
+        single: set[Instant] = {self._instant(moment) for moment in event.more}
         if event.rule is not None and not single and next(self._dates(), None) is None:
             later = self._start.instant(self._zone) > self._now + MAX_AHEAD
             self._plan.skipped.append(Skipped(self._title, LATER if later else NO_DATE))
@@ -192,18 +192,18 @@ class _Planned:
         return Moment(local, self._zone).instant(self._zone)
 
     def _instant(self, moment: Moment) -> Instant:
-        """One that is without an hour is the event's date of that day."""
+        """A moment without an hour means the event's date of that day."""
         local = moment.local
         if moment.whole_day and not self._start.whole_day:
             local = datetime.combine(local.date(), self._start.local.time())
         return Moment(local, moment.zone or self._zone).instant(self._zone)
 
     def _dates(self) -> Iterator[datetime]:
-        """By the event's rule: those of the half years that are booked now, in local time."""
+        """Yield the local times of the event's rule in the half years that are booked now."""
         rule = self._event.rule
         if rule is None:
             return
-        since = _half_year(self._local(self._now - LOOK_BACK))[0]
+        since = _half_year(self._local(self._now - LOOK_BACK_S))[0]
         before = _half_year(self._local(self._now + MAX_AHEAD))[1]
         until = rule.until
         if isinstance(until, datetime):
@@ -226,7 +226,7 @@ class _Planned:
         return datetime.fromtimestamp(at, self._zone).replace(tzinfo=None)
 
     def _runtime(self, begin: datetime) -> int:
-        """Seconds, of a date. Raises ValueError."""
+        """Return the length in seconds of the date that begins at `begin`. Raises ValueError."""
         start, end, length = self._start, self._event.end, self._event.duration
         if start.whole_day:
             default = length if length is not None else timedelta(days=1)
@@ -244,7 +244,7 @@ class _Planned:
 
     def _add_once(self, at: Instant) -> None:
         runtime = self._runtime(self._local(at))
-        if at + runtime < self._now - LOOK_BACK:
+        if at + runtime < self._now - LOOK_BACK_S:
             self._plan.skipped.append(Skipped(self._title, OVER))
             return
         ids = self._ids(at, at, 0, runtime)
@@ -260,7 +260,7 @@ class _Planned:
         instants = [*map(self._at, dates)]
         runtime = min(map(self._runtime, dates))
         if self._start.whole_day:
-            # As the RCM wants it: days may be an hour shorter.
+            # The RCM refuses overlapping dates, and a day may be an hour shorter.
             runtime = min(runtime, step * DAY - 3_600)
         ids = self._ids(instants[0], instants[-1], step, runtime)
         if ids[0] in self._plan.ids:
@@ -271,10 +271,10 @@ class _Planned:
             return
         coming = [at for at in instants if at > self._now]
         left = [at for at in coming if at not in given_up]
-        # From one that is put off by a change of clocks all that follow would be, too.
+        # A booking that began on a date moved by a change of clocks would move all later dates too.
         while left and self._local(left[0]).time() != self._start.local.time():
-            gone = f"its hour does not exist on {self._local(left.pop(0)):%Y-%m-%d}; book that date by itself"
-            self._plan.skipped.append(Skipped(self._title, gone, failed=True))
+            no_hour = f"its hour does not exist on {self._local(left.pop(0)):%Y-%m-%d}; book that date by itself"
+            self._plan.skipped.append(Skipped(self._title, no_hour, failed=True))
         dropped = tuple(at for at in coming if at in given_up)
         if not coming:
             self._plan.skipped.append(Skipped(self._title, OVER))
@@ -304,7 +304,7 @@ class _Planned:
         )
 
     def _ids(self, first: Instant, last: Instant, step: int, runtime: int) -> tuple[str, ...]:
-        """Of an event that is changed they are others, but for its title."""
+        """Return the ids, which change with the event, except its title."""
         options, event = self._options, self._event
         needs = sorted(
             (name, sorted((key, str(value)) for key, value in of.items())) for name, of in self._needs.items()
@@ -313,7 +313,7 @@ class _Planned:
         which = None if event.instead_of is None else of(event.instead_of)
         terms = [options.priority, options.maintenance, self._zone.key if step else ""]
         known = [event.uid or self._title, which, first, last, step, runtime, needs, terms]
-        return tuple(_hashed([*known, number], 20) + options.suffix for number in range(TIMES))
+        return tuple(_hashed([*known, number], 20) + options.suffix for number in range(MAX_TIMES_BOOKED))
 
 
 def _half_year(at: datetime) -> tuple[datetime, datetime]:
@@ -322,5 +322,5 @@ def _half_year(at: datetime) -> tuple[datetime, datetime]:
     return begin, datetime(at.year + second, 1 if second else 7, 1)  # noqa: DTZ001
 
 
-def _hashed(what: list[Any], digits: int) -> str:
-    return hashlib.sha256(json.dumps(what).encode()).hexdigest()[:digits]
+def _hashed(parts: list[Any], digits: int) -> str:
+    return hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:digits]

@@ -1,4 +1,4 @@
-"""Who maintenance displaces: holds that end for it, and bookings that are in conflict with it."""
+"""The holds that end for maintenance, and the bookings in conflict with it."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from zscout.terminal import clean, clock, print_line, span
 
 
 class Displaced:
-    """What maintenance of `needs` at this priority costs others; `spans`: its dates, by fleet time."""
+    """Holds and bookings that maintenance of `needs` at this priority displaces. `spans`: its dates, by fleet time."""
 
     def __init__(
         self,
@@ -23,15 +23,15 @@ class Displaced:
         spans: Sequence[tuple[float, float]],
         priority: int,
         state: RcmState,
-        told: BookingsTold,
+        answer: BookingsTold,
     ) -> None:
         self._priority = priority
         self.rcs = {view.rc for view in state.rcs if any(covers(need, view.rc, view.host) for need in needs)}
         self.ends: list[tuple[HoldView, float]] = []
-        """Holds that end for it, and in how many seconds: at its first date, or after their minimum runtimes."""
+        """Holds that end for it, with the seconds until then: its first date, or the end of the minimum runtime."""
         self.stays: list[HoldView] = []
         """Holds that it waits for."""
-        before = max(0.0, min((start for start, _ in spans), default=told.time) - told.time)
+        before = max(0.0, min((start for start, _ in spans), default=answer.time) - answer.time)
         for hold in state.holds:
             if self.rcs.isdisjoint(hold.needs):
                 continue
@@ -40,8 +40,8 @@ class Displaced:
             elif hold.keep or hold.remaining > before:
                 self.stays.append(hold)
         self.bookings: list[tuple[BookingView, BookedDate]] = []
-        """The next date that is lost of each booking."""
-        for booking in told.bookings:
+        """Bookings that lose dates, each with the first date it loses."""
+        for booking in answer.bookings:
             if not booking.maintenance and booking.priority < priority:
                 lost = (date for date in booking.dates if self._meets(booking, date, spans))
                 self.bookings += [(booking, date) for date in lost][:1]
@@ -74,7 +74,8 @@ class Displaced:
         }
 
     async def agree(self, name: str, *, yes: bool) -> None:
-        """Print it on stderr, and ask if anything is displaced. Raises Failed for a no, BadInput without a terminal."""
+        """Print the lines on stderr, and ask if anything is displaced. Raises Failed: for a no, or with exit code 2 if
+        there is no terminal."""
         for line in self.lines():
             print_line(clean(f"{name} {line}"), sys.stderr)
         if self and not yes:

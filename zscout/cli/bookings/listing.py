@@ -73,29 +73,29 @@ async def bookings(mine: bool, rc: str | None, at: WrittenDate | None, zone: Zon
     async with common.connected("bookings") as client:
         me = User.of(client)
         try:
-            told = await ask_bookings(client, None if rc is not None and is_pattern(rc) else rc)
+            answer = await ask_bookings(client, None if rc is not None and is_pattern(rc) else rc)
         except RequestRefused as refused:
             raise explained(refused) from None
-        found = [one for one in told.bookings if not mine or is_own(one, me)]
+        found = [booking for booking in answer.bookings if not mine or is_own(booking, me)]
         if rc is not None and is_pattern(rc):
-            found = [one for one in found if _may_have(one, matcher(rc), rc)]
-        day = None if at is None else _day(at, told.time, zone)
+            found = [booking for booking in found if _may_have(booking, matcher(rc), rc)]
+        day = None if at is None else _day(at, answer.time, zone)
         if day is not None:
-            found = [booking for one in found if (booking := _on_day(one, day, zone)).dates]
+            found = [there for booking in found if (there := _on_day(booking, day, zone)).dates]
         if as_json:
             terminal.print_json(
                 {
                     "fleet": client.fleet.name,
-                    "time": utc(told.time),
-                    "clocks": told.clocks,
-                    "bookings": [booking_json(one, me) for one in found],
+                    "time": utc(answer.time),
+                    "clocks": answer.clocks,
+                    "bookings": [booking_json(booking, me) for booking in found],
                 }
             )
             return
-        for host, differs in sorted(told.clocks.items()):
+        for host, differs in sorted(answer.clocks.items()):
             click.secho(clean(clock_words(host, differs)), fg="yellow", err=True)
-        if told.corrected is not None:
-            click.secho(clean(corrected_words(told.corrected)), fg="yellow", err=True)
+        if answer.corrected is not None:
+            click.secho(clean(corrected_words(answer.corrected)), fg="yellow", err=True)
         if not found:
             terminal.print_line("nothing is booked" + (f" on {day:%a %Y-%m-%d}" if day is not None else ""))
         else:
@@ -108,7 +108,8 @@ async def bookings(mine: bool, rc: str | None, at: WrittenDate | None, zone: Zon
 @common.json_option("Print one JSON object.")
 @common.runs
 async def show(booking: str, zone: ZoneInfo | None, as_json: bool) -> None:
-    """Show one booking with all its dates of the next 60 days: by its name, its id, or four or more characters of it.
+    """Show one booking with all its dates of the next 60 days. Name it by its name, its id, or the first four or more
+    characters of its id.
 
     \b
     Examples:
@@ -116,8 +117,8 @@ async def show(booking: str, zone: ZoneInfo | None, as_json: bool) -> None:
       zscout booking show 3f2a91c0 --json | jq -r .dates[0].start
     """
     async with common.connected("booking") as client:
-        told, me = await ask_bookings(client), User.of(client)
-        found = choose(told.bookings, booking, me)
+        answer, me = await ask_bookings(client), User.of(client)
+        found = choose(answer.bookings, booking, me)
     if as_json:
         terminal.print_json(booking_json(found, me))
         return
@@ -139,7 +140,7 @@ def _day(at: WrittenDate, now: float, zone: ZoneInfo | None) -> datetime.date:
 
 
 def _on_day(booking: BookingView, day: datetime.date, zone: ZoneInfo | None) -> BookingView:
-    """The booking with those of its dates that have a part of the day."""
+    """Return the booking with only its dates that overlap the day."""
     return replace(
         booking,
         dates=[
@@ -151,23 +152,30 @@ def _on_day(booking: BookingView, day: datetime.date, zone: ZoneInfo | None) -> 
 
 
 def _may_have(booking: BookingView, matches: Callable[[str], bool], pattern: str) -> bool:
-    """Whether it is of an RC that matches, or by that pattern."""
+    """Return True if the booking has an RC that matches, or asks by that pattern."""
     bound = {rc for date in booking.dates for rc in date.bound.values()}
     return any(matches(need) or need.partition("#")[0] == pattern for need in (*booking.needs, *bound))
 
 
 def _table(found: Sequence[BookingView], me: User, zone: ZoneInfo | None, *, every_date: bool) -> Table:
     lines: list[tuple[float, Sequence[str], str]] = []
-    for one in found:
+    for booking in found:
         shown = [
             date
-            for number, date in enumerate(one.dates)
+            for number, date in enumerate(booking.dates)
             if every_date or number == 0 or date.danger or date.state == "conflict"
         ]
-        lines += [(date.start, _row(one, date, zone), _style(one, date, me)) for date in shown]
+        lines += [(date.start, _row(booking, date, zone), _style(booking, date, me)) for date in shown]
         if not shown:
-            row = (one.name, short(one), whose(one), date_words(one.start, zone), "later", str(one.priority))
-            lines.append((one.start, (*row, _repeated(one, zone), rcs_words(one)), ""))
+            row = (
+                booking.name,
+                short(booking),
+                whose(booking),
+                date_words(booking.start, zone),
+                "later",
+                str(booking.priority),
+            )
+            lines.append((booking.start, (*row, _repeated(booking, zone), rcs_words(booking)), ""))
     lines.sort(key=lambda line: line[0])
     columns = ("NAME", "ID", "WHO", "WHEN", "STATE", "PRIORITY", "REPEATED", "DEVICES")
     rows, styles = [line[1] for line in lines], [line[2] for line in lines]
@@ -184,7 +192,7 @@ def _repeated(booking: BookingView, zone: ZoneInfo | None) -> str:
     if not booking.every:
         return "-"
     with suppress(ValueError):  # not known here
-        zone = zone_of(booking.zone)  # its last day is one there
+        zone = zone_of(booking.zone)  # the last day is a day of the booking's zone
     until = f" until {in_zone(booking.until, zone):%Y-%m-%d}" if booking.until is not None else ""
     return every_words(booking.every) + until
 
@@ -203,11 +211,12 @@ def _style(booking: BookingView, date: BookedDate, me: User) -> str:
 @common.json_option("Print one JSON object.")
 @common.runs
 async def unbook(booking: str, at: WrittenDate | None, zone: ZoneInfo | None, yes: bool, as_json: bool) -> None:
-    """Cancel a booking, or one date of it: by its name, its id, or the first four or more characters of its id.
+    """Cancel a booking, or one date of it. Name it by its name, its id, or the first four or more characters of its id.
 
-    A name means your own booking, if you have one of that name. Before it cancels another user's it asks; if stdin is
-    not a terminal, add --yes. In a secured fleet only operators may. A request that already uses the booking keeps
-    running. If several bookings have the name, it is refused with the list of them.
+    A name means your own booking, if you have one of that name. Before the command cancels another user's booking it
+    asks; if stdin is not a terminal, add --yes. In a secured fleet only operators may cancel others' bookings. A
+    request that already uses the booking keeps running. If several bookings have the name, the command lists them and
+    cancels none.
 
     \b
     Examples:
@@ -218,9 +227,9 @@ async def unbook(booking: str, at: WrittenDate | None, zone: ZoneInfo | None, ye
     if at is not None:
         zone = zone or host_zone()
     async with common.connected("unbook") as client:
-        told, me = await ask_bookings(client), User.of(client)
-        found = choose(told.bookings, booking, me)
-        start = None if at is None or zone is None else _date_of(found, at, zone, told.time)
+        answer, me = await ask_bookings(client), User.of(client)
+        found = choose(answer.bookings, booking, me)
+        start = None if at is None or zone is None else _date_of(found, at, zone, answer.time)
         await ask_for_others(client, [] if is_own(found, me) else [label(found)], "cancel", yes=yes)
         try:
             left = await BookingsClient(client).unbook(found.id, start)
@@ -235,17 +244,17 @@ async def unbook(booking: str, at: WrittenDate | None, zone: ZoneInfo | None, ye
 
 
 def _date_of(booking: BookingView, at: WrittenDate, zone: ZoneInfo, now: float) -> int:
-    """The date of a booking that is meant. Raises Failed where there is none, BadInput."""
-    told = [one.start for one in booking.dates]
-    coming = told + [one for one in dates(_record(booking), now + WINDOW, now + MAX_AHEAD) if one not in told]
+    """Return the start of the booking's date that `at` means. Raises Failed if there is none, BadInput for several."""
+    listed = [date.start for date in booking.dates]
+    coming = listed + [start for start in dates(_record(booking), now + WINDOW, now + MAX_AHEAD) if start not in listed]
     day = at.whole_day(now, zone)
     if day is not None:
-        meant = [one for one in coming if in_zone(one, zone).date() == day]
+        meant = [start for start in coming if in_zone(start, zone).date() == day]
     else:
         exactly = at.found(now, zone).at.timestamp()
-        meant = [one for one in coming if one == exactly]
+        meant = [start for start in coming if start == exactly]
     if not meant:
-        known = ", ".join(date_words(one, zone) for one in coming[:3])
+        known = ", ".join(date_words(start, zone) for start in coming[:3])
         raise Failed(f"{booking.name} has no such date; it has {known or 'none'}{', ...' * (len(coming) > 3)}")
     if len(meant) > 1:
         raise BadInput(f"--date: {booking.name} begins more than once on that day; write the time as well")

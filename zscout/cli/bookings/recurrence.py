@@ -1,7 +1,7 @@
-"""How an event of a calendar is repeated (RFC 5545, section 3.3.10), as far as it can be booked. Pure.
+"""Repetition rules of calendar events (RFC 5545, section 3.3.10), as far as zscout can book them. Pure.
 
-dateutil would go on to the year 9999 where nothing matches, and for ever at an interval of 0; a calendar is a file of
-others."""
+Not dateutil: calendar files are untrusted, and dateutil searches to the year 9999 if nothing matches, and for ever at
+an interval of 0."""
 
 from __future__ import annotations
 
@@ -20,23 +20,24 @@ PARTS: Final = {
     "MONTHLY": frozenset({"BYDAY", "BYMONTHDAY", "BYMONTH", "BYSETPOS", "WKST"}),
     "YEARLY": frozenset({"BYDAY", "BYMONTHDAY", "BYMONTH", "BYSETPOS", "WKST"}),
 }
-"""What may stand beside FREQ, INTERVAL, COUNT and UNTIL."""
+"""By FREQ: the parts allowed beside FREQ, INTERVAL, COUNT and UNTIL."""
 MAX_INTERVAL: Final = 1_000
 MAX_COUNT: Final = 1_000
 MAX_LISTED: Final = 100
-"""Of each kind: weekdays, days of the month."""
+"""Values in one part, as weekdays or days of the month."""
 DAYS_OF_WEEK: Final = ("MO", "TU", "WE", "TH", "FR", "SA", "SU")
 
 
 @dataclass(frozen=True, slots=True)
 class RepeatRule:
-    """`by_day` has (which of the month, or 0 for all; weekday from 0, Monday). Empty: as its first date has it."""
+    """A parsed RRULE. `by_day`: (number in the month or 0 for all, weekday with 0 for Monday). Empty parts follow the
+    event's first date."""
 
     freq: str
     interval: int = 1
     count: int | None = None
     until: date | None = None
-    """A date, or a datetime: in UTC, or where it has no zone by the event's own clock."""
+    """A date, or a datetime in UTC; without a zone it is local time of the event."""
     by_day: tuple[tuple[int, int], ...] = ()
     by_monthday: tuple[int, ...] = ()
     by_month: tuple[int, ...] = ()
@@ -45,17 +46,17 @@ class RepeatRule:
 
     @property
     def step(self) -> int:
-        """Days between two dates of a weekday, or of all; 0: it is not the same number each time."""
+        """Days between two dates (WEEKLY: of one weekday); 0: not constant, or too long for a repeated booking."""
         days = {"DAILY": 1, "WEEKLY": 7}.get(self.freq, 0) * self.interval
         return days if days <= DAYS else 0
 
 
 def parse_rule(parts: Mapping[str, Sequence[Any]]) -> RepeatRule:
-    """A rule as icalendar reads it. Raises ValueError for one that is not followed here."""
+    """Convert a rule as icalendar parses it. Raises ValueError for an unsupported rule."""
     found = {str(name).upper(): list(values) for name, values in parts.items()}
-    freq = str(_one(found, "FREQ", "")).upper()
-    if freq == "DAILY" and "BYDAY" in found and _one(found, "INTERVAL", 1) == 1:
-        freq = "WEEKLY"  # as some write it
+    freq = str(_single_value(found, "FREQ", "")).upper()
+    if freq == "DAILY" and "BYDAY" in found and _single_value(found, "INTERVAL", 1) == 1:
+        freq = "WEEKLY"  # some programs write it as DAILY with BYDAY
     allowed = PARTS.get(freq)
     if allowed is None:
         raise ValueError(f"its repetition {freq or 'is unknown: it'} can't be booked")
@@ -63,20 +64,20 @@ def parse_rule(parts: Mapping[str, Sequence[Any]]) -> RepeatRule:
         raise ValueError(f"its repetition {freq} with {', '.join(odd)} can't be booked")
     if any(len(values) > MAX_LISTED for values in found.values()):
         raise ValueError("its rule is too long")
-    interval, most = _one(found, "INTERVAL", 1), _one(found, "COUNT", None)
+    interval, most = _single_value(found, "INTERVAL", 1), _single_value(found, "COUNT", None)
     if not 1 <= interval <= MAX_INTERVAL or (most is not None and not 1 <= most <= MAX_COUNT):
         raise ValueError(f"its INTERVAL or COUNT is not from 1 to {MAX_COUNT}")
-    days = tuple((one.relative or 0, DAYS_OF_WEEK.index(str(one.weekday))) for one in found.get("BYDAY", []))
+    days = tuple((day.relative or 0, DAYS_OF_WEEK.index(str(day.weekday))) for day in found.get("BYDAY", []))
     rule = RepeatRule(
         freq,
         interval,
         most,
-        _one(found, "UNTIL", None),
+        _single_value(found, "UNTIL", None),
         days,
         tuple(map(int, found.get("BYMONTHDAY", []))),
         tuple(map(int, found.get("BYMONTH", []))),
         tuple(map(int, found.get("BYSETPOS", []))),
-        DAYS_OF_WEEK.index(str(_one(found, "WKST", "MO"))),
+        DAYS_OF_WEEK.index(str(_single_value(found, "WKST", "MO"))),
     )
     if rule.until is not None and not isinstance(rule.until, date):
         raise ValueError("its UNTIL is not a date")
@@ -87,8 +88,8 @@ def parse_rule(parts: Mapping[str, Sequence[Any]]) -> RepeatRule:
     return rule
 
 
-def _one(parts: Mapping[str, Sequence[Any]], name: str, default: Any) -> Any:
-    """Raises ValueError where there are several."""
+def _single_value(parts: Mapping[str, Sequence[Any]], name: str, default: Any) -> Any:
+    """Return the only value of a part. Raises ValueError for several."""
     values = parts.get(name, [default])
     if len(values) != 1:
         raise ValueError(f"its rule has more than one {name}")
@@ -96,8 +97,8 @@ def _one(parts: Mapping[str, Sequence[Any]], name: str, default: Any) -> Any:
 
 
 def occurrences(rule: RepeatRule, start: datetime, since: datetime, before: datetime) -> Iterator[datetime]:
-    """The local times from `since` on and before `before` at which an event begins that began first at `start`, all
-    without a zone. UNTIL is left to who knows the zone."""
+    """Yield the local times in [`since`, `before`) of an event whose first date is `start`, all without a zone. UNTIL
+    is not applied: the caller knows the zone."""
     number = 0
     for period in count(0 if rule.count is not None else _periods(rule, start, since)):
         begin, days = _period(rule, start.date(), period)
@@ -115,14 +116,14 @@ def occurrences(rule: RepeatRule, start: datetime, since: datetime, before: date
 
 
 def _periods(rule: RepeatRule, start: datetime, since: datetime) -> int:
-    """How many are over by then, or fewer."""
+    """Return a lower bound of the number of periods that are over at `since`."""
     months = (since.year - start.year) * 12 + since.month - start.month
     over = {"DAILY": (since - start).days, "WEEKLY": (since - start).days // 7, "MONTHLY": months}
     return max(0, over.get(rule.freq, since.year - start.year) // rule.interval - 1)
 
 
 def _period(rule: RepeatRule, first: date, number: int) -> tuple[date, Iterable[date]]:
-    """When a day, week, month or year begins, and the days of it that count, in order."""
+    """Return the first day of period `number` (a day, week, month or year), and its matching days in order."""
     over = rule.interval * number
     if rule.freq == "DAILY":
         day = first + timedelta(days=over)

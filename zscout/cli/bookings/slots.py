@@ -1,4 +1,4 @@
-"""`zscout slots`: when devices are free together."""
+"""`zscout slots`: list times at which devices are free together."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ from zscout.terminal import Table, span
 
 @click.command()
 @needs_argument
-@click.option("--for", "runtime", type=DURATION, required=True, help="For how long: 90s, 5m, 2h, 1d12h.")
+@click.option("--for", "runtime", type=DURATION, required=True, help="Length of the booking: 90s, 5m, 2h, 1d12h.")
 @click.option("--within", type=seconds_within(1, MAX_AHEAD), default="7d", help="Search this far ahead.")
 @click.option("--from", "since", type=DATE, help="Search from this date on. Default: from now on.")
-@click.option("--limit", type=click.IntRange(1, MAX_SLOTS), default=5, help="List at most so many.")
+@click.option("--limit", type=click.IntRange(1, MAX_SLOTS), default=5, help="List at most this many times.")
 @click.option("--priority", type=click.IntRange(-MAX_PRIORITY, MAX_PRIORITY), default=0, help="The booking's priority.")
 @zone_option
 @common.json_option("Print one JSON object.")
@@ -42,8 +42,8 @@ async def slots(
 ) -> None:
     """List the first times at which all of the devices can be booked together.
 
-    Each line is a stretch of time: a booking may begin at any moment of it. Other bookings, and holds that would not
-    yield, are taken into account. Exit code 1: there is no such time.
+    Each line is a range of times at which the booking may begin. Other bookings, and holds that would not yield, are
+    taken into account. Exit code 1: there is no such time.
 
     \b
     Examples:
@@ -59,25 +59,25 @@ async def slots(
             start = since.found((await ask_bookings(client)).time, zone).at
         try:
             how: dict[str, Any] = {"start": start, "priority": priority, "limit": limit}
-            told = await BookingsClient(client).slots(wanted, runtime, within, **how)
+            answer = await BookingsClient(client).slots(wanted, runtime, within, **how)
         except RequestRefused as refused:
             raise explained(refused) from None
         fleet = client.fleet.name
     if as_json:
-        found = [{"start": utc(one.start), "latest": utc(one.latest), "bound": one.bound} for one in told.slots]
-        terminal.print_json({"fleet": fleet, "time": utc(told.time), "slots": found, "complete": told.complete})
-    elif told.slots:
-        _table(told, zone).print()
-    if not told.slots:
-        more = "" if told.complete else " that was looked at"
+        found = [{"start": utc(slot.start), "latest": utc(slot.latest), "bound": slot.bound} for slot in answer.slots]
+        terminal.print_json({"fleet": fleet, "time": utc(answer.time), "slots": found, "complete": answer.complete})
+    elif answer.slots:
+        _table(answer, zone).print()
+    if not answer.slots:
+        more = "" if answer.complete else " in the part searched"
         raise common.Failed(f"the devices are not free together{more} within {span(within)}; raise --within")
 
 
-def _table(told: SlotsTold, zone: ZoneInfo | None) -> Table:
+def _table(answer: SlotsTold, zone: ZoneInfo | None) -> Table:
     rows = []
-    for one in told.slots:
-        bound = ", ".join(f"{rc} for {need}" for need, rc in sorted(one.bound.items()))
-        latest = date_words(one.latest, zone) if one.latest > one.start else "then only"
-        rows.append((date_words(one.start, zone), latest, in_words(one.start - told.time), bound))
+    for slot in answer.slots:
+        bound = ", ".join(f"{rc} for {need}" for need, rc in sorted(slot.bound.items()))
+        latest = date_words(slot.latest, zone) if slot.latest > slot.start else "then only"
+        rows.append((date_words(slot.start, zone), latest, in_words(slot.start - answer.time), bound))
     columns = ("BEGIN FROM", "AT THE LATEST", "FIRST", "WITH")[: 4 if any(row[3] for row in rows) else 3]
     return Table("", columns, [row[: len(columns)] for row in rows])
