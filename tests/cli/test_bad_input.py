@@ -158,9 +158,9 @@ doctor --keys --all --json | there is no option --all (see zscout doctor --help)
 cert ca --days 0 | --days: "0" is not a time up to 36,525 days; write it as in 90, 12h, 90s
 cert issue anvil | zscout-ca/ca-key.pem: there is no such file; make a CA with `zscout cert ca`, or name its folder by
 cert issue a/b | name "a/b" is not valid; use 1 to 64 of A-Z a-z 0-9 _ . -
-cert show | no folder is given; name one, or set $ZSCOUT_KEYS
+cert show | no folder is given; name a folder, or set $ZSCOUT_KEYS
 view none.rrd | none.rrd: there is no such file; recordings of nodes and of zscout view are in runs/
-view not.rrd | not.rrd: is not a Rerun recording; name a .rrd file
+view not.rrd | not.rrd: not a Rerun recording; name a .rrd file
 view --bind somewhere | --bind: "somewhere" is not an IP address; write one, as in 127.0.0.1
 view --port 0 | --port: 0 is out of range; write 1 to 65535
 replay none.toml | none.toml: there is no such file; check the path

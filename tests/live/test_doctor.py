@@ -94,7 +94,7 @@ async def test_a_fleet_that_is_well_is_told_to_be(lab: Lab) -> None:
     told = await mends(lab, [])
     assert told.code == 0
     assert told.of("leader") == [("ok", "anvil leads, term 1")]
-    assert told.of("devices") == [("ok", "1 device there and well")]
+    assert told.of("devices") == [("ok", "1 device present and working")]
     assert [state for state, _ in told.of("open")] == ["note"]
 
 
@@ -105,7 +105,7 @@ async def test_a_device_on_two_hosts_is_told_of(tmp_path: Path) -> None:
         client = await lab.begun()
         lab.node("bellows", "robot/a")
         await lab.state(client, lambda state: [view.duplicates for view in state.rcs] == [["bellows"]])
-        both = "robot/a is offered by anvil, bellows, and anvil is meant"
+        both = "robot/a is offered by anvil, bellows, using the instance at anvil"
         told = await told_of(lab, "devices", both)
         assert told.of("devices")[0] == ("note", both)
 
@@ -116,7 +116,7 @@ async def test_why_nobody_leads_is_told_and_what_a_node_should_offer_is_missed(t
         lab.node("anvil", "robot/a")
         client = await lab.client()
         await lab.living(client, Role.RC, lambda found: found == ["anvil"])
-        nobody = "nobody leads: of the candidates forge none is seen"
+        nobody = "no leader: no candidate is seen (forge)"
         await mends(lab, [nobody])
         file = lab.folder / "cart.toml"
         file.write_text('[node]\nhost = "cart"\nfleet = "fleet.toml"\n[[rc]]\nname = "robot/c"\ndriver = "exclusive"')
@@ -125,7 +125,7 @@ async def test_why_nobody_leads_is_told_and_what_a_node_should_offer_is_missed(t
         file.write_text(file.read_text().replace("exclusive", "none-such"))
         missing, nobody, *_ = (await doctor(lab, file)).mends()
         assert missing == f'{file}: rc[0].driver (robot/c): no driver "none-such" is installed here'
-        assert nobody.startswith("nobody leads")  # it joins all the same
+        assert nobody.startswith("no leader")  # it joins all the same
 
 
 @pytest.mark.slow
@@ -152,7 +152,7 @@ async def test_a_relay_that_is_not_linked_is_told(lab: Lab) -> None:
     lab.fleet_file.write_text(plain.replace("[mesh]\n", '[mesh]\nsite = "north"\n'))
     lab.node("anvil", "robot/a")
     await lab.logged("anvil", "is on the mesh")
-    alone = r"no relay is linked: this host sees its own site only \(north\)"
+    alone = r"no link to a relay: this host sees its own site only \(north\)"
     assert (await told_of(lab, "site", alone)).code == 1
     with zenoh.open(zenoh_config(replace(lab.fleet.mesh, relay=("north", "south")))):
         assert (await told_of(lab, "site", "site north, linked to 1 relay")).code == 0
@@ -170,7 +170,7 @@ async def test_whose_role_is_taken_away_is_told_first(tmp_path: Path, lab: Close
     lab.node("anvil")
     await shown(lab, "bob", "anvil")
     keys = tmp_path / "keys" / "ada"
-    unseen = f"1 link, and nobody of fleet {lab.fleet.name} is seen by ada"
+    unseen = f"1 link, but no participant of fleet {lab.fleet.name} is visible to ada"
     told = await told_of(lab, "certificate", unseen, ZSCOUT_KEYS=keys, ZSCOUT_FLEET=before)
     assert told.mends() == [unseen]
     told = await doctor(lab, ZSCOUT_KEYS=keys)
@@ -183,7 +183,7 @@ async def test_another_name_of_the_fleet_is_told(lab: Lab) -> None:
     await lab.ready(await lab.client(), "robot/a")
     other = lab.folder / "other.toml"
     other.write_text(lab.fleet_file.read_text().replace(lab.fleet.name, "typo"))
-    others = rf"nobody is seen of fleet typo, and of others: {lab.fleet.name} \(anvil\)"
+    others = rf"no participant of fleet typo is found; others are: {lab.fleet.name} \(anvil\)"
     assert (await told_of(lab, "links", others, ZSCOUT_FLEET=other)).code == 1
 
 
@@ -224,7 +224,7 @@ async def test_certificates_of_another_ca_are_told_by_both_sides_and_expired_one
         file.write((keys / "ada" / "ca.pem").read_text())
     refused = r"anvil \(tls/.*\) refuses this certificate: unknown ca"
     told = await told_of(lab, "security", refused, ZSCOUT_KEYS=tmp_path / "bob")
-    assert told.of("links") == [("mend", "no link to anybody")]
+    assert told.of("links") == [("mend", "no link to another process")]
 
     lab.authority.issue("eve", keys / "late", timedelta(seconds=1), now - DAY)
     told = await doctor(lab, ZSCOUT_KEYS=keys / "late")

@@ -16,7 +16,7 @@ from tests.hang import HANG
 from tests.live.bench import Bench, Stand, until
 from tests.live.lab import Lab
 from zscout.cli.fleet.status import figures_text
-from zscout.cli.fleet.watching import lasting
+from zscout.cli.fleet.watching import without_volatile
 from zscout.messages import Figures
 
 
@@ -107,7 +107,7 @@ async def test_health_and_figures_of_devices(lab: Lab) -> None:
 
 def test_figures_alone_make_no_new_block_of_watch() -> None:
     told = {"rcs": [{"rc": "robot/a", "health": "ok", "figures": {"dropped": 3.0}}]}
-    assert lasting(told) == {"rcs": [{"rc": "robot/a", "health": "ok"}]}
+    assert without_volatile(told) == {"rcs": [{"rc": "robot/a", "health": "ok"}]}
 
 
 def test_figures_in_words() -> None:

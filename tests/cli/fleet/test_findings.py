@@ -116,11 +116,11 @@ def test_who_has_no_role_is_told_so() -> None:
 @pytest.mark.parametrize(
     ("mesh", "more", "says"),
     [
-        (MeshConfig(multicast=False), {}, "it is off, and `connect` names nobody: no host finds another"),
+        (MeshConfig(multicast=False), {}, "it is off, and `connect` is empty: hosts can't find each other"),
         (MeshConfig(), {"interfaces": {"eth0": "Network is unreachable"}}, "(eth0: Network is unreachable)"),
         (MeshConfig(), {"interfaces": {}}, "(no interface is up for it)"),
         (MeshConfig(), {"interfaces": {}}, "; until then this host works alone, and joins the others by itself"),
-        (MeshConfig(), {"heard": []}, "nobody is heard at 224.0.0.224:7446 on eth0"),
+        (MeshConfig(), {"heard": []}, "no process is found at 224.0.0.224:7446 on eth0"),
     ],
 )
 def test_without_multicast_nobody_is_found(mesh: MeshConfig, more: dict[str, object], says: str) -> None:
@@ -242,7 +242,7 @@ def test_a_relay_and_the_site_that_belong_together_are_told() -> None:
         return [(one.state, str(one)) for one in findings(asked) if one.about == "site"]
 
     ((state, words),) = told(north)
-    assert (state, words.partition(";")[0]) == ("mend", "no relay is linked: this host sees its own site only (north)")
+    assert (state, words.partition(";")[0]) == ("mend", "no link to a relay: this host sees its own site only (north)")
     assert told(north, relays=1) == [("ok", "site north, linked to 1 relay")]
     assert not told(north, links=0)
     assert not told(north, links=None)
@@ -269,25 +269,27 @@ def test_links_without_anybody_of_the_fleet_are_explained() -> None:
         assert found.state == "mend"
         return str(found)
 
-    assert said(PLAIN, links=0).startswith("no link to anybody; ")
-    assert said(PLAIN, links=2).startswith("2 links, and nobody of fleet zscout is seen through them; ")
-    assert "nobody is seen of fleet zscout, and of others: lab (anvil)" in said(PLAIN, plain={"lab": {"anvil"}})
+    assert said(PLAIN, links=0).startswith("no link to another process; ")
+    assert said(PLAIN, links=2).startswith("2 links, but no participant of fleet zscout is seen through them; ")
+    assert "no participant of fleet zscout is found; others are: lab (anvil)" in said(PLAIN, plain={"lab": {"anvil"}})
     shut_out = seen(CLOSED, links=1, certificates=certificates(), **alone)
     told = findings(shut_out)
-    assert mends(shut_out)[0][1].startswith("1 link, and nobody of fleet zscout is seen by ada; name it under [roles] ")
+    assert mends(shut_out)[0][1].startswith(
+        "1 link, but no participant of fleet zscout is visible to ada; name it under [roles] "
+    )
     assert [one.about for one in told if one.state == "mend"] == ["certificate"]
     refused = Called("tls/b:1", "tls", "", shown("bellows"), "CA one", trusted=True, objection="unknown ca")
-    assert said(CLOSED, links=1, answers=[refused]).startswith("no link to anybody; ")
+    assert said(CLOSED, links=1, answers=[refused]).startswith("no link to another process; ")
     assert said(PLAIN, unjoined="the mesh can't be joined: x") == "the mesh can't be joined: x"
 
 
 @pytest.mark.parametrize(
     ("candidates", "hosts", "says"),
     [
-        ((), {}, "nobody leads: no host is seen that may"),
-        (("anvil", "forge"), host("bellows", Role.NODE), "nobody leads: of the candidates anvil, forge none is seen"),
-        (("forge",), host("anvil", Role.NODE, Role.CANDIDATE), "nobody leads: of the candidates forge none is seen"),
-        ((), host("anvil", Role.NODE, Role.CANDIDATE), "nobody leads, though anvil could"),
+        ((), {}, "no leader: no host that may lead is seen"),
+        (("anvil", "forge"), host("bellows", Role.NODE), "no leader: no candidate is seen (anvil, forge)"),
+        (("forge",), host("anvil", Role.NODE, Role.CANDIDATE), "no leader: no candidate is seen (forge)"),
+        ((), host("anvil", Role.NODE, Role.CANDIDATE), "no leader, though anvil could lead"),
         ((), host("anvil", Role.NODE, Role.CANDIDATE, Role.RCM), "anvil leads and does not answer"),
     ],
 )
@@ -350,7 +352,7 @@ def test_a_device_that_is_lost_or_double_is_told() -> None:
     both = leading("anvil", "robot/a") | host("bellows", Role.NODE, rcs=["robot/a"])
     double = seen(hosts=both, state=led(view("robot/a", duplicates=["bellows"])))
     assert not mends(double)  # one may be a substitute
-    assert "robot/a is offered by anvil, bellows, and anvil is meant" in [one.says for one in findings(double)]
+    assert "robot/a is offered by anvil, bellows, using the instance at anvil" in [one.says for one in findings(double)]
     half = seen(hosts=leading("anvil", "robot/a"), state=led(view("robot/a", unseen={"bellows": 9.0})))
     assert the_mend(half).says == "robot/a: its other host bellows is not seen"
     leaderless = findings(seen(hosts=both, state=None))

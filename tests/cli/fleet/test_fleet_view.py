@@ -11,7 +11,7 @@ import pytest
 from tests.mesh.kit import run, until
 from tests.services.rcm.kit import FakeFleet
 from zscout.behaviors.client.client import Client
-from zscout.cli.fleet.fleet_view import QUIET, Devices, FleetView
+from zscout.cli.fleet.fleet_view import QUIET_S, Devices, FleetView
 from zscout.keyexpr import Keys, Role, Sender, Token
 from zscout.mesh import Reply
 from zscout.messages import HostRanking, LoadReport, RankAsk, RcAsk, RcState
@@ -92,7 +92,7 @@ def test_a_candidate_that_is_not_there_is_not_waited_for_long() -> None:
         async with led("x", "nowhere") as fleet, looking(fleet) as view:
             began = view.mesh.now()
             await view.settled()
-            assert QUIET <= (view.mesh.now() - began) / SECOND < QUIET + SOON
+            assert QUIET_S <= (view.mesh.now() - began) / SECOND < QUIET_S + SOON
             assert not view.all_hosts()["nowhere"].tokens
 
     run(story())

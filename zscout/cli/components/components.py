@@ -10,7 +10,7 @@ import click
 from zscout import terminal
 from zscout.cli import common, completion
 from zscout.cli.components.placing import COMPONENT, ask_nodes, placement_object, placer_of, tail_of, unknown_here
-from zscout.cli.fleet.fleet_view import FIND_LOADS, FleetView, see_hosts
+from zscout.cli.fleet.fleet_view import FIND_LOADS_S, FleetView, see_hosts
 from zscout.cli.fleet.watching import Overview, show
 from zscout.config.strict import BadInput
 from zscout.keyexpr import Role
@@ -97,7 +97,7 @@ class Listing:
 
         if hosts:
             await self.fleet_view.ask_loads()
-        await common.until(reported, self.fleet_view.changed, FIND_LOADS)
+        await common.until(reported, self.fleet_view.changed, FIND_LOADS_S)
         await self.find_ages()
 
     async def refresh(self) -> None:

@@ -1,4 +1,4 @@
-"""`zscout cert`: the certificates of a secured fleet, made, renewed and shown."""
+"""`zscout cert`: make, renew and show the certificates of a secured fleet."""
 
 from __future__ import annotations
 
@@ -36,11 +36,12 @@ if TYPE_CHECKING:
 CA_FOLDER: Final = Path("zscout-ca")
 MAX_DAYS: Final = 36_525
 STYLES: Final = {"valid": "green", "ends_soon": "yellow"}
-"""Of those that can be used."""
+"""Styles of usable certificates."""
 FOLDER: Final = click.Path(file_okay=False, path_type=Path)
 
 
-def _lasting(text: str, option: str) -> timedelta:
+def _parse_days(text: str, option: str) -> timedelta:
+    """Parse days (`90`) or a duration (`12h`). Raises BadInput."""
     seconds = strict.parse_duration(f"{text}d") or strict.parse_duration(text)
     if not seconds or not 1 <= seconds <= MAX_DAYS * 86_400:
         raise BadInput(f"{option}: {quoted(text)} is not a time up to {MAX_DAYS:,} days; write it as in 90, 12h, 90s")
@@ -49,8 +50,8 @@ def _lasting(text: str, option: str) -> timedelta:
 
 def days_option(default: str) -> Callable[[F], F]:
     """`--days`; the parameter is `lasts`."""
-    kind = Parsed("days", _lasting)
-    return click.option("--days", "lasts", type=kind, default=default, help="Days that it is valid; or as in 12h.")
+    kind = Parsed("days", _parse_days)
+    return click.option("--days", "lasts", type=kind, default=default, help="Validity in days, or as in 12h.")
 
 
 ca_option = click.option(
@@ -62,7 +63,7 @@ ca_option = click.option(
 def cert() -> None:
     """Make, renew and show the certificates of a secured fleet.
 
-    A certificate is a folder with ca.pem, cert.pem and key.pem, of a machine or of a person. All but `show` need
+    A certificate of a machine or person is a folder with ca.pem, cert.pem and key.pem. All commands but `show` need
     the package cryptography.
 
     \b
@@ -77,11 +78,11 @@ def cert() -> None:
 @cert.command()
 @click.argument("folder", type=FOLDER, default=CA_FOLDER)
 @days_option("3650")
-@click.option("--force", is_flag=True, help="Overwrite a CA: certificates that it issued can't be renewed then.")
+@click.option("--force", is_flag=True, help="Overwrite an existing CA: its certificates can't be renewed then.")
 def ca(folder: Path, lasts: timedelta, force: bool) -> None:
     """Make a CA in FOLDER. Keep its key secret.
 
-    Whoever has ca-key.pem can issue certificates in any name: keep it on one machine, best outside the fleet.
+    With ca-key.pem anyone can issue certificates in any name: keep it on one machine, best outside the fleet.
 
     \b
     Examples:
@@ -124,14 +125,14 @@ def issue(name: tuple[str, ...], ca: Path, to: Path, lasts: timedelta, managers:
     authority = _authority(ca)
     if not name and not managers:
         raise BadInput("name at least one machine or person")
-    if dots := next((one for one in (*managers, *name) if not one.strip(".")), None):
-        raise BadInput(f"{quoted(dots)} can't be a folder's name; use a letter or a digit")
-    for one in (*managers, *name):
-        _check_free(to / one, (CA, CERT, KEY), force)
-    for one in (*managers, *name):
+    if dots := next((owner for owner in (*managers, *name) if not owner.strip(".")), None):
+        raise BadInput(f"{quoted(dots)} can't be the name of a folder; use a letter or a digit")
+    for owner in (*managers, *name):
+        _check_free(to / owner, (CA, CERT, KEY), force)
+    for owner in (*managers, *name):
         with _writing():
-            ends = authority.issue(one, to / one, lasts, datetime.now(UTC), manager=one in managers)
-        terminal.print_line(f"{to / one}: until {shown(ends)}; copy this folder to {one}, its key to nobody else")
+            ends = authority.issue(owner, to / owner, lasts, datetime.now(UTC), manager=owner in managers)
+        terminal.print_line(f"{to / owner}: until {shown(ends)}; copy this folder to {owner} and its key nowhere else")
 
 
 @cert.command()
@@ -161,10 +162,10 @@ def renew(folders: tuple[Path, ...], ca: Path, lasts: timedelta, new_key: bool) 
 @click.argument("folders", metavar="[FOLDER]...", type=FOLDER, nargs=-1)
 @common.json_option("Print one JSON object.")
 def show(folders: tuple[Path, ...], as_json: bool) -> int:
-    """Show the name and the end of the certificates in these folders, and what is wrong with them.
+    """Show name, end and problems of the certificates in these folders.
 
-    Without FOLDER it shows the folder that $ZSCOUT_KEYS names. FOLDER may be a CA's. Exit code 1: a certificate is
-    expired, not valid yet, or can't be used.
+    Without FOLDER the command shows the folder in $ZSCOUT_KEYS. FOLDER may be a CA's. Exit code 1: a certificate has
+    expired, is not valid yet, or can't be used.
 
     \b
     Examples:
@@ -173,21 +174,21 @@ def show(folders: tuple[Path, ...], as_json: bool) -> int:
       zscout cert show anvil --json | jq '.certificates[0].ends_in'
     """
     if not folders:
-        named = os.environ.get(KEYS_VARIABLE)
-        if not named:
-            raise BadInput(f"no folder is given; name one, or set ${KEYS_VARIABLE}")
-        folders = (Path(named),)
+        variable = os.environ.get(KEYS_VARIABLE)
+        if not variable:
+            raise BadInput(f"no folder is given; name a folder, or set ${KEYS_VARIABLE}")
+        folders = (Path(variable),)
     now = datetime.now(UTC)
-    found = [one for folder in folders for one in _found(folder, now)]
+    found = [certificate for folder in folders for certificate in _found(folder, now)]
     if as_json:
         terminal.print_json({"certificates": found})
     else:
         _print(found)
-    return int(any(one["state"] not in STYLES for one in found))
+    return int(any(certificate["state"] not in STYLES for certificate in found))
 
 
 def _found(folder: Path, now: datetime) -> Iterator[dict[str, Any]]:
-    """What `--json` prints of a folder: one object, or one for each CA where it is a CA's."""
+    """Yield the object of `--json` for a folder; for the folder of a CA an object for each CA in ca.pem."""
     nothing: dict[str, Any] = dict.fromkeys(("name", "ends", "ends_in", "issuer", "trusted", "problem"))
     held: list[Certificates] | list[Validity]
     try:
@@ -195,33 +196,37 @@ def _found(folder: Path, now: datetime) -> Iterator[dict[str, Any]]:
     except BadInput as error:
         yield {"folder": str(folder), "state": "unusable", **nothing, "problem": str(error)}
         return
-    for one in held:
-        more = {"issuer": one.issuer, "trusted": one.trusted} if isinstance(one, Certificates) else {}
-        said = {"name": one.name, "ends": one.ends.isoformat(), "ends_in": one.ends_in(now)}
-        yield {"folder": str(folder), "state": _state(one, now), **nothing, **said, **more}
+    for certificate in held:
+        more = (
+            {"issuer": certificate.issuer, "trusted": certificate.trusted}
+            if isinstance(certificate, Certificates)
+            else {}
+        )
+        shared = {"name": certificate.name, "ends": certificate.ends.isoformat(), "ends_in": certificate.ends_in(now)}
+        yield {"folder": str(folder), "state": _state(certificate, now), **nothing, **shared, **more}
 
 
-def _state(one: Validity, now: datetime) -> str:
-    if now < one.begins:
+def _state(validity: Validity, now: datetime) -> str:
+    if now < validity.begins:
         return "not_yet"
-    if now >= one.ends:
+    if now >= validity.ends:
         return "expired"
-    return "ends_soon" if one.soon(now) else "valid"
+    return "ends_soon" if validity.soon(now) else "valid"
 
 
 def _print(found: list[dict[str, Any]]) -> None:
     rows = []
-    for one in found:
-        state = one["state"].replace("_", " ")
-        if one["name"] is None:
-            rows.append((one["folder"], "-", state, "-", "-", one["problem"]))
+    for certificate in found:
+        state = certificate["state"].replace("_", " ")
+        if certificate["name"] is None:
+            rows.append((certificate["folder"], "-", state, "-", "-", certificate["problem"]))
             continue
-        ends = shown(datetime.fromisoformat(one["ends"]))
-        left = f"{ends} ({terminal.span(one['ends_in'])})" if one["ends_in"] > 0 else ends
-        about = "CA" if one["trusted"] is None else f"trusts {', '.join(one['trusted'])}"
-        rows.append((one["folder"], one["name"], state, left, one["issuer"] or "-", about))
+        ends = shown(datetime.fromisoformat(certificate["ends"]))
+        left = f"{ends} ({terminal.span(certificate['ends_in'])})" if certificate["ends_in"] > 0 else ends
+        about = "CA" if certificate["trusted"] is None else f"trusts {', '.join(certificate['trusted'])}"
+        rows.append((certificate["folder"], certificate["name"], state, left, certificate["issuer"] or "-", about))
     columns = ("FOLDER", "NAME", "STATE", "ENDS", "ISSUER", "ABOUT")
-    Table("", columns, rows, [STYLES.get(one["state"], "red") for one in found], ("ISSUER",)).print()
+    Table("", columns, rows, [STYLES.get(certificate["state"], "red") for certificate in found], ("ISSUER",)).print()
 
 
 def _authority(folder: Path) -> CertificateAuthority:

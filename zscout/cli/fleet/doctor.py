@@ -1,6 +1,6 @@
-"""`zscout doctor`: looks at everything that keeps hosts from one another, whether or not the mesh can be joined.
+"""`zscout doctor`: collect evidence on everything that may keep hosts apart, even if the mesh can't be joined.
 
-What is made of it stands in `findings.py`."""
+`findings.py` draws the conclusions."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ from zscout.keyexpr import valid_name
 from zscout.services.bookings.host_clock import is_synchronised
 from zscout.terminal import Table
 
-JOINED: Final = 7.0
-"""Seconds in which whoever is on the mesh is seen, and a candidate takes the lead."""
-RELAY: Final = 1.0
-"""Seconds more for a link to the relay."""
-LISTENS: Final = 3
+SETTLE_TIMEOUT_S: Final = 7.0
+"""Within this time all participants are seen, and a candidate takes the lead."""
+RELAY_TIMEOUT_S: Final = 1.0
+"""Additional time for a link to the relay."""
+MAX_ADDRESSES: Final = 3
 """Addresses of one process that are called."""
 STYLES: Final = {"ok": "green", "note": "yellow", "mend": "bold red"}
 
@@ -44,15 +44,15 @@ STYLES: Final = {"ok": "green", "note": "yellow", "mend": "bold red"}
 async def doctor(file: Path | None, only_keys: bool, as_json: bool) -> int:
     """Find out why there is no link, no leader or no device, and how to fix it.
 
-    With FILE, a node file, it looks as that node would, with its files and certificate; without FILE, as any
-    command, with the fleet file. It takes up to ten seconds, and works when nothing else runs.
+    With FILE, a node file, the checks use that node's files and certificate; without FILE, the fleet file, like any
+    command. They take up to ten seconds, and work when nothing else runs.
 
-    Each line is `ok`, a `note`, or something to `mend`, causes first. Exit code 0: nothing has to be fixed; 1:
-    something has to, or a file has a mistake.
+    STATE is `ok`, `note`, or `mend` for a problem to fix; causes come first. Exit code 0: nothing has to be fixed; 1:
+    there is a problem, or a file has a mistake.
 
-    With --keys it lists the participants on the mesh by host, and their keys, to see whether two hosts see each
-    other, to write a client in another language, or to write access rules. HOW: `query` keys are answered, `put`
-    keys are published, `hear` keys are subscribed to. Exit code 3: nobody is there.
+    With --keys the command lists the participants on the mesh by host, and their keys, to see whether two hosts see
+    each other, to write a client in another language, or to write access rules. HOW: `query` keys are answered, `put`
+    keys are published, `hear` keys are subscribed to. Exit code 3: no participant is there.
 
     \b
     Examples:
@@ -68,14 +68,14 @@ async def doctor(file: Path | None, only_keys: bool, as_json: bool) -> int:
         return 0
     seen = await _look(file)
     found = findings(seen)
-    bad = [one for one in found if one.state == "mend"]
+    bad = [finding for finding in found if finding.state == "mend"]
     if as_json:
-        lines = [{name: getattr(one, name) for name in Finding.__slots__} for one in found]
+        lines = [{name: getattr(finding, name) for name in Finding.__slots__} for finding in found]
         fleet = seen.fleet.name if seen.fleet is not None else None
         terminal.print_json({"fleet": fleet, "host": seen.host or None, "mend": len(bad), "findings": lines})
     else:
-        rows = [(one.state, one.about, str(one)) for one in found]
-        Table("", ("STATE", "ABOUT", "FINDING"), rows, [STYLES[one.state] for one in found]).print()
+        rows = [(finding.state, finding.about, str(finding)) for finding in found]
+        Table("", ("STATE", "ABOUT", "FINDING"), rows, [STYLES[finding.state] for finding in found]).print()
     return int(bool(bad))
 
 
@@ -89,7 +89,7 @@ async def _look(file: Path | None) -> Evidence:
             seen.fleet = common.the_fleet()
         seen.file = str(file or common.fleet_file() or "")
     except BadInput as error:
-        if (named := file or common.fleet_file()) is not None and not named.exists():
+        if (given := file or common.fleet_file()) is not None and not given.exists():
             raise
         seen.bad.append(("files", error))
         return seen
@@ -103,15 +103,15 @@ async def _look(file: Path | None) -> Evidence:
     if mesh.multicast:
         seen.interfaces = probing.multicast_problems(mesh)
         seen.heard = await probing.heard(mesh)
-    heard = [address for one in seen.heard for address in one.addresses[:LISTENS]]
+    heard = [address for process in seen.heard for address in process.addresses[:MAX_ADDRESSES]]
 
     async def call() -> None:
         seen.answers = await probing.call(mesh.connect, heard, cas, seen.certificates)
-        plain = [one.address for one in seen.answers if one.speaks == "plain"]
+        plain = [answer.address for answer in seen.answers if answer.speaks == "plain"]
         if plain:
             seen.plain = await asyncio.to_thread(probing.plain_fleets, plain)
 
-    async with asyncio.TaskGroup() as both:  # when it is interrupted it waits until the mesh is left
+    async with asyncio.TaskGroup() as both:  # on Ctrl-C it waits until the mesh is left
         both.create_task(call())
         if _may_join(seen, seen.fleet):
             both.create_task(_join(seen, seen.fleet))
@@ -119,7 +119,7 @@ async def _look(file: Path | None) -> Evidence:
 
 
 def _look_at_certificates(seen: Evidence, fleet: Fleet) -> str:
-    """The CAs that are trusted, in PEM; empty where there are none."""
+    """Read the certificates; return the trusted CAs in PEM, or "" without any."""
     if fleet.security is None:
         return ""
     cas = ""
@@ -166,17 +166,17 @@ async def _join(seen: Evidence, fleet: Fleet) -> None:
             with FleetView(client) as view:
                 devices = Devices(view)
                 with suppress(TimeoutError, common.NobodyThere):
-                    async with asyncio.timeout(JOINED):
+                    async with asyncio.timeout(SETTLE_TIMEOUT_S):
                         seen.state = await view.settled()
                 with suppress(TimeoutError):
                     async with asyncio.timeout(1.0):
                         await devices.ask()
-                if seen.state is not None and (told := await booked.look(client)) is not None:
-                    own = time.time() - told.time
-                    seen.clocks = told.clocks | ({seen.host: own} if abs(own) > booked.MAX_CLOCK_DIFFERENCE_S else {})
+                if seen.state is not None and (answer := await booked.look(client)) is not None:
+                    own = time.time() - answer.time
+                    seen.clocks = answer.clocks | ({seen.host: own} if abs(own) > booked.MAX_CLOCK_DIFFERENCE_S else {})
                 with suppress(TimeoutError):
-                    async with asyncio.timeout(RELAY if fleet.mesh.site is not None else 0):
-                        while not client.mesh.relays():  # noqa: ASYNC110 - nothing tells
+                    async with asyncio.timeout(RELAY_TIMEOUT_S if fleet.mesh.site is not None else 0):
+                        while not client.mesh.relays():  # noqa: ASYNC110 - no event for it
                             await asyncio.sleep(probing.POLL)
                 seen.relays = client.mesh.relays()
                 seen.links, seen.hosts, seen.devices = client.mesh.links(), view.hosts, devices.known()

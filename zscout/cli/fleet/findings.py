@@ -1,4 +1,4 @@
-"""What `zscout doctor` makes of what it saw: why there is no link, no leader, no device. Pure."""
+"""Findings of `zscout doctor` from its evidence: reasons for a missing link, leader or device. Pure."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ SECURE: Final = "docs/how-to/secure-a-fleet.md"
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """One line: what is `about`, whether it is `ok`, a `note`, or something to `mend`, and then how."""
+    """A line of the report. State `mend`: a problem to fix."""
 
     about: str
     state: Literal["ok", "note", "mend"]
@@ -44,40 +44,40 @@ class Finding:
 
 @dataclass(slots=True)
 class Evidence:
-    """All that was found out. What could not be looked at is None, or empty."""
+    """The evidence. Fields that could not be examined are None, or empty."""
 
     at: datetime
     host: str = ""
-    """In whose name it was looked: this host's or person's."""
+    """Name of the host or person that the checks act as."""
     file: str = ""
-    """That says how; empty: there is none."""
+    """The fleet or node file; empty: none."""
     fleet: Fleet | None = None
     node: Node | None = None
     bad: list[tuple[str, BadInput]] = field(default_factory=list)
-    """About what, and what is wrong with it."""
+    """Errors by subject: (about, error)."""
     certificates: Certificates | None = None
     seals: bool = False
-    """Whether the key by which managers seal places is there."""
+    """True if the key by which managers seal places exists."""
     interfaces: Mapping[str, str] = field(default_factory=dict)
-    """Those that multicast would use, with why it can't."""
+    """Interfaces for multicast, each with its problem or ""."""
     heard: Sequence[Heard] = ()
     answers: Sequence[Called] = ()
-    """Of the addresses under `connect`, and of those that were heard."""
+    """Results for the addresses under `connect`, and for those of `heard`."""
     plain: Mapping[str, Collection[str]] = field(default_factory=dict)
     """Hosts with nodes on the network without TLS, by fleet."""
     unjoined: str | None = None
-    """Why the mesh could not be joined."""
+    """The reason that the mesh could not be joined."""
     links: int | None = None
-    """None: it was not joined."""
+    """None: the mesh was not joined."""
     relays: int = 0
-    """Of the links, those to one."""
+    """Number of links to relays."""
     hosts: Mapping[str, Host] = field(default_factory=dict)
     state: RcmState | None = None
     devices: Mapping[str, RcState] = field(default_factory=dict)
     clock_kept: bool | None = None
-    """Whether something keeps this host's clock."""
+    """True if a time service synchronizes this host's clock; None: unknown."""
     clocks: Mapping[str, float] = field(default_factory=dict)
-    """By how many seconds hosts' clocks are ahead of fleet time, where they differ by more than 2."""
+    """Seconds by which clocks of hosts are ahead of fleet time; only differences above 2 s."""
 
 
 def findings(seen: Evidence) -> list[Finding]:
@@ -86,7 +86,7 @@ def findings(seen: Evidence) -> list[Finding]:
         return [*found, *_clock(seen)]
     network = (_security, _multicast, _called, _links, _site)
     parts = (_files, _certificate, *network, _leader, _devices, _hosts, _clock, _open)
-    return [*found, *(one for part in parts for one in part(seen))]
+    return [*found, *(finding for part in parts for finding in part(seen))]
 
 
 def _bad(about: str, error: BadInput) -> Finding:
@@ -113,7 +113,7 @@ def _certificate(seen: Evidence) -> Iterator[Finding]:
         says = f"{own.cert}: {own.name} has no role in fleet {fleet.name}"
         yield Finding("certificate", "mend", says, "name it under [roles] of the fleet file, on all hosts")
     elif _shut_out(seen):
-        says = f"{many(seen.links or 0, 'link')}, and nobody of fleet {fleet.name} is seen by {own.name}"
+        says = f"{many(seen.links or 0, 'link')}, but no participant of fleet {fleet.name} is visible to {own.name}"
         remedy = (
             "name it under [roles] in the files of the others (did it lose its role?); is the fleet's name the same?"
         )
@@ -129,8 +129,8 @@ def _certificate(seen: Evidence) -> Iterator[Finding]:
 
 
 def _shut_out(seen: Evidence) -> bool:
-    """Whether its certificate is taken, and its name may not see anybody."""
-    refused = any(one.objection for one in seen.answers)  # a link that is refused lives for a moment
+    """Return True if our certificate is accepted, but its name has no right to see any participant."""
+    refused = any(answer.objection for answer in seen.answers)  # a refused link exists for a moment
     secured = seen.fleet is not None and seen.fleet.security is not None
     return secured and bool(seen.links) and not refused and not any(host.tokens for host in seen.hosts.values())
 
@@ -145,7 +145,7 @@ def _multicast(seen: Evidence) -> Iterator[Finding]:
     if not mesh.multicast:
         if not mesh.connect:
             remedy = "name hosts under connect, or remove multicast = false"
-            yield Finding("multicast", "mend", "it is off, and `connect` names nobody: no host finds another", remedy)
+            yield Finding("multicast", "mend", "it is off, and `connect` is empty: hosts can't find each other", remedy)
         else:
             yield Finding("multicast", "note", "it is off: only the hosts under `connect` are found")
         return
@@ -155,7 +155,7 @@ def _multicast(seen: Evidence) -> Iterator[Finding]:
         why = (
             "; ".join(f"{name}: {problem}" for name, problem in seen.interfaces.items()) or "no interface is up for it"
         )
-        remedy = "mend `interface` under [mesh] or the network, or name hosts under connect"
+        remedy = "correct `interface` under [mesh], fix the network, or name hosts under connect"
         remedy += "; until then this host works alone, and joins the others by itself" * (not seen.interfaces)
         yield Finding("multicast", "note" if linked else "mend", f"it is not possible here ({why})", remedy)
     elif not seen.heard:
@@ -163,51 +163,53 @@ def _multicast(seen: Evidence) -> Iterator[Finding]:
             "start zscout-node; if one runs: same multicast_address and network? A firewall lets UDP "
             f"{mesh.multicast_address.rpartition(':')[2]} through? Else name hosts under connect"
         )
-        yield Finding("multicast", "note" if linked else "mend", f"nobody is heard at {where}", remedy)
+        yield Finding("multicast", "note" if linked else "mend", f"no process is found at {where}", remedy)
     else:
-        here = sum(one.here for one in seen.heard)
+        here = sum(process.here for process in seen.heard)
         heard = f"{len(seen.heard)} {'process' if len(seen.heard) == 1 else 'processes'}"
         yield Finding(
-            "multicast", "ok", f"{heard} heard at {where}, {here} of them here, {len(seen.heard) - here} elsewhere"
+            "multicast", "ok", f"{heard} found at {where}, {here} of them here, {len(seen.heard) - here} elsewhere"
         )
 
 
 def _called(seen: Evidence) -> Iterator[Finding]:
-    """The addresses that files name, and who is not heard as it says."""
+    """Yield problems of the addresses under `connect`."""
     fleet = _the_fleet(seen)
-    named = [one for one in seen.answers if one.address in fleet.mesh.connect]
-    # Of a host that is seen to run one of its own addresses is no matter: it may well listen at another.
-    own = [one for one in named if not one.speaks and (one.here or _host_in(one.address) == seen.host)]
+    named = [answer for answer in seen.answers if answer.address in fleet.mesh.connect]
+    # If this host's node runs, an own address without an answer does not matter: the node may listen at another.
+    own = [answer for answer in named if not answer.speaks and (answer.here or _host_in(answer.address) == seen.host)]
     if own and not (seen.host in seen.hosts and seen.hosts[seen.host].has(Role.NODE)):
         says = f"this host's node does not run ({own[0].address}: {own[0].problem})"
         yield Finding("connect", "mend", says, "start zscout-node here")
-    for one in named:
-        if one in own:
+    for answer in named:
+        if answer in own:
             continue
-        if not one.speaks:
+        if not answer.speaks:
             remedy = "is the host up, does zscout-node run and listen there, does a firewall let it through?"
-            yield Finding("connect", "mend", f"{one.address}: {one.problem}", remedy)
-        elif one.speaks == "plain" and one.address.startswith("tls/"):
+            yield Finding("connect", "mend", f"{answer.address}: {answer.problem}", remedy)
+        elif answer.speaks == "plain" and answer.address.startswith("tls/"):
             remedy = "give that host the fleet file with [security], and restart its node"
-            yield Finding("connect", "mend", f"{one.address}: answers without TLS", remedy)
-        elif one.speaks == "tls" and one.address.startswith("tcp/"):
+            yield Finding("connect", "mend", f"{answer.address}: answers without TLS", remedy)
+        elif answer.speaks == "tls" and answer.address.startswith("tcp/"):
             remedy = f"write tls/ there, and [security] ({SECURE})"
-            yield Finding("connect", "mend", f"{one.address}: takes TLS only", remedy)
+            yield Finding("connect", "mend", f"{answer.address}: takes TLS only", remedy)
 
 
 def _host_in(address: str) -> str:
-    """The name in it, without its domain."""
+    """Return the host name in an address, without its domain."""
     return address.partition("/")[2].rpartition(":")[0].partition(".")[0]
 
 
 def _security(seen: Evidence) -> Iterator[Finding]:
     fleet = _the_fleet(seen)
-    closed = [one for one in seen.answers if one.speaks == "tls"]
-    # Two fleets on one network, of which one is secured, are well: it is told whose hosts they are by their names.
+    closed = [answer for answer in seen.answers if answer.speaks == "tls"]
+    # A secured fleet beside another on one network is no problem: the names tell apart whose hosts they are.
     members = {*fleet.access.ranks, *fleet.candidates, *fleet.devices}
     if fleet.security is None:
-        ours = sorted({one.certificate.name for one in closed if one.certificate and one.certificate.name in members})
-        names = ours or sorted({one.certificate.name if one.certificate else one.address for one in closed})
+        ours = sorted(
+            {answer.certificate.name for answer in closed if answer.certificate and answer.certificate.name in members}
+        )
+        names = ours or sorted({answer.certificate.name if answer.certificate else answer.address for answer in closed})
         if closed and (ours or not (seen.hosts or seen.plain.get(fleet.name))):
             says = f"{_listed(names)} {_take(names)} TLS only, and this host's files have no [security]"
             yield Finding("security", "mend", says, f"use the files of the secured fleet ({SECURE})")
@@ -217,37 +219,41 @@ def _security(seen: Evidence) -> Iterator[Finding]:
     if mixed := sorted(seen.plain.get(fleet.name, ())):
         says = f"{_listed(mixed)} {'runs' if len(mixed) == 1 else 'run'} fleet {fleet.name} without certificates"
         yield Finding("security", "mend", says, "give them the fleet file with [security], and restart their nodes")
-    if (own := seen.certificates) is None:  # why is told already, and whom they trust is not known
+    if (own := seen.certificates) is None:  # reported already; the trusted CAs are unknown
         return
-    for (name, issuer), addresses in _by_name(one for one in closed if not one.trusted):
+    for (name, issuer), addresses in _by_name(answer for answer in closed if not answer.trusted):
         says = f"{name} ({addresses[0]}) shows a certificate of {issuer}, and {CA} trusts {', '.join(own.trusted)}"
         if name in members:
             yield Finding("security", "mend", says, f"issue both by one CA, or put both CAs into {CA} ({SECURE})")
         else:
             yield Finding("security", "note", f"another fleet here is secured: {name} ({addresses[0]}), by {issuer}")
-    for one in {one.certificate.name: one for one in closed if one.trusted and one.certificate is not None}.values():
-        yield from _member(one.address, one.certificate, one.objection, seen)  # type: ignore[arg-type]
+    for answer in {
+        answer.certificate.name: answer for answer in closed if answer.trusted and answer.certificate is not None
+    }.values():
+        yield from _member(answer.address, answer.certificate, answer.objection, seen)  # type: ignore[arg-type]
 
 
 def _member(address: str, certificate: Validity, objection: str, seen: Evidence) -> Iterator[Finding]:
-    """A host whose certificate is of a CA of ours."""
+    """Check a host whose certificate one of our CAs issued."""
     name = f"{certificate.name} ({address})"
     if seen.at >= certificate.ends:
         says = f"the certificate of {name} expired on {shown(certificate.ends)}"
-        yield Finding("security", "mend", says, "renew it (zscout cert renew), and restart its node if that is alone")
+        yield Finding(
+            "security", "mend", says, "renew it (zscout cert renew); if its node is cut off, restart the node"
+        )
     elif seen.at < certificate.begins:
         says = f"the certificate of {name} is valid from {shown(certificate.begins)} on"
         yield Finding("security", "mend", says, "set the clocks of this host and of the CA's (timedatectl)")
     elif objection and not any(about == "certificate" for about, _ in seen.bad):
         says = f"{name} refuses this certificate: {objection}"
-        yield Finding("security", "mend", says, f"is its {CA} that of this CA, is its clock right?")
+        yield Finding("security", "mend", says, f"has its {CA} this CA, is its clock right?")
 
 
 def _by_name(answers: Iterable[Called]) -> list[tuple[tuple[str, str], list[str]]]:
     found = defaultdict[tuple[str, str], list[str]](list)
-    for one in answers:
-        name = one.certificate.name if one.certificate is not None else "somebody"
-        found[name, one.issuer or "an unknown CA"].append(one.address)
+    for answer in answers:
+        name = answer.certificate.name if answer.certificate is not None else "an unnamed host"
+        found[name, answer.issuer or "an unknown CA"].append(answer.address)
     return sorted(found.items())
 
 
@@ -264,19 +270,19 @@ def _links(seen: Evidence) -> Iterator[Finding]:
     if here:
         yield Finding("links", "ok", f"{many(seen.links, 'link')}; seen: {_listed(here)}")
     elif others and fleet.security is None:
-        remedy = "mend the fleet's name in the file, or start zscout-node with it"
-        yield Finding("links", "mend", f"nobody is seen of fleet {fleet.name}, and of others: {known}", remedy)
+        remedy = "correct the fleet's name in the file, or start zscout-node with it"
+        yield Finding("links", "mend", f"no participant of fleet {fleet.name} is found; others are: {known}", remedy)
     elif seen.links and fleet.security is None:
-        says = f"{many(seen.links, 'link')}, and nobody of fleet {fleet.name} is seen through them"
+        says = f"{many(seen.links, 'link')}, but no participant of fleet {fleet.name} is seen through them"
         yield Finding("links", "mend", says, "is the fleet's name the same there?")
     else:
-        yield Finding("links", "mend", "no link to anybody", "mend what stands above, or start zscout-node")
+        yield Finding("links", "mend", "no link to another process", "fix the problems above, or start zscout-node")
     if here and others:
         yield Finding("links", "note", f"other fleets on this network: {known}")
 
 
 def _site(seen: Evidence) -> Iterator[Finding]:
-    """A relay links only to those whose `site` it names, and refuses the others without a word."""
+    """A relay links only to processes whose `site` it names, and refuses others silently."""
     fleet = _the_fleet(seen)
     if fleet.mesh.relay:
         return
@@ -285,12 +291,12 @@ def _site(seen: Evidence) -> Iterator[Finding]:
             yield Finding("site", "ok", f"site {site}, linked to {many(seen.relays, 'relay')}")
         elif seen.links and not _shut_out(seen):
             remedy = "does zscout-relay run, is it under connect, does its `relay` name this site?"
-            yield Finding("site", "mend", f"no relay is linked: this host sees its own site only ({site})", remedy)
+            yield Finding("site", "mend", f"no link to a relay: this host sees its own site only ({site})", remedy)
         return
-    heard = {address: one for one in seen.heard if one.relay for address in one.addresses}
-    called = [one.address for one in seen.answers if one.address in heard and one.trusted]
-    ours = [*fleet.access.roles.relay, *called, *(one for one in fleet.mesh.connect if one in heard)]
-    if names := ours or [one.addresses[0] for one in heard.values() if one.addresses][:1]:
+    heard = {address: relay for relay in seen.heard if relay.relay for address in relay.addresses}
+    called = [answer.address for answer in seen.answers if answer.address in heard and answer.trusted]
+    ours = [*fleet.access.roles.relay, *called, *(address for address in fleet.mesh.connect if address in heard)]
+    if names := ours or [relay.addresses[0] for relay in heard.values() if relay.addresses][:1]:
         whose = "" if ours else " if it is this fleet's,"
         says = f"no `site` is set, so no link to the relay ({names[0]}):{whose} this host sees its own site only"
         yield Finding("site", "mend" if ours else "note", says, "set `site` under [mesh] as the relay's file names it")
@@ -301,7 +307,7 @@ def _leader(seen: Evidence) -> Iterator[Finding]:
     if seen.links is None or _shut_out(seen):
         return
     leads = sorted(name for name, host in seen.hosts.items() if host.has(Role.RCM))
-    # One that the file does not name leads nobody.
+    # A candidate that the file does not name never leads.
     named = {*(fleet.candidates or seen.hosts)}
     could = sorted(name for name, host in seen.hosts.items() if host.has(Role.CANDIDATE) and name in named)
     missing = [name for name in fleet.candidates if name not in could]
@@ -312,13 +318,13 @@ def _leader(seen: Evidence) -> Iterator[Finding]:
         yield Finding("leader", "mend", f"{_listed(leads)} leads and does not answer", remedy)
     elif could:
         remedy = "see the log of zscout-node there; is each linked to all others?"
-        yield Finding("leader", "mend", f"nobody leads, though {_listed(could)} could", remedy)
+        yield Finding("leader", "mend", f"no leader, though {_listed(could)} could lead", remedy)
     elif fleet.candidates:
-        says = f"nobody leads: of the candidates {_listed(fleet.candidates)} none is seen"
+        says = f"no leader: no candidate is seen ({_listed(fleet.candidates)})"
         yield Finding("leader", "mend", says, "start zscout-node on one of them, with this fleet's file")
         return
     else:
-        says = "nobody leads: no host is seen that may"
+        says = "no leader: no host that may lead is seen"
         yield Finding("leader", "mend", says, "start zscout-node on a host, without candidate = false")
         return
     if missing:
@@ -349,9 +355,9 @@ def _devices(seen: Evidence) -> Iterator[Finding]:
             else_do = files.get(rc, "ignore this if it was removed: it is listed for a day")
             missing[home, absence(view) if view is not None else "", else_do].append(rc)
         elif device is not None and device.health != "ok":
-            yield Finding("devices", "mend", f"{rc} at {device.host} is lost: {device.health}", "mend the device")
+            yield Finding("devices", "mend", f"{rc} at {device.host} is lost: {device.health}", "repair the device")
         elif words := unwell(device):
-            yield Finding("devices", "note", f"{rc} is {words}", "wait, or mend the device")
+            yield Finding("devices", "note", f"{rc} is {words}", "wait, or repair the device")
         elif view is not None and not view.present:
             remedy = "is its node linked to the leader's? See the log of both"
             yield Finding("devices", "mend", f"{rc}: {absence(view) or 'its leader does not see it'}", remedy)
@@ -359,11 +365,11 @@ def _devices(seen: Evidence) -> Iterator[Finding]:
             well += 1
         stand_by = {*view.duplicates, view.host} if view is not None and view.duplicates else set[str]()
         if len(at := sorted(offered[rc] | stand_by)) > 1:
-            meant = f", and {view.host} is meant" if view is not None and view.host else ""
+            meant = f", using the instance at {view.host}" if view is not None and view.host else ""
             remedy = "unless the others are substitutes, remove it from their node files"
             yield Finding("devices", "note", f"{rc} is offered by {_listed(at)}{meant}", remedy)
         for other in view.unseen if view is not None else ():
-            remedy = "is it up, is the network cut in two? If it has the device no more, it is forgotten after a day"
+            remedy = "is it up, is the network cut in two? If it no longer has the device, it is forgotten after a day"
             yield Finding("devices", "mend", f"{rc}: its other host {other} is not seen", remedy)
     for (home, why, else_do), rcs in sorted(missing.items()):
         there = home in seen.hosts and seen.hosts[home].has(Role.NODE)
@@ -374,7 +380,7 @@ def _devices(seen: Evidence) -> Iterator[Finding]:
         says = f"not there: {_listed(rcs)} of {home or 'no known host'}" + (f" ({why})" if why else "")
         yield Finding("devices", "mend", says, f"{remedy}{'' if there else ','} or {else_do}")
     if well and not missing:
-        yield Finding("devices", "ok", f"{many(well, 'device')} there and well")
+        yield Finding("devices", "ok", f"{many(well, 'device')} present and working")
 
 
 def _hosts(seen: Evidence) -> Iterator[Finding]:
@@ -383,19 +389,19 @@ def _hosts(seen: Evidence) -> Iterator[Finding]:
     for name, report in reports.items():
         if report.renew and name != own:
             yield _ends_soon(name, report.certificate_ends_in or 0.0)
-    told = versions(seen.hosts, seen.devices, seen.state)
-    if (words := mixture(told)) is not None:
-        yield Finding("versions", "note", words, "upgrade what is old, and use new settings then")
-    elif told:
-        yield Finding("versions", "ok", f"all run {VERSION}, as this command does")
+    running = versions(seen.hosts, seen.devices, seen.state)
+    if (words := mixture(running)) is not None:
+        yield Finding("versions", "note", words, "upgrade the older ones before you use new settings")
+    elif running:
+        yield Finding("versions", "ok", f"all run {VERSION}, like this command")
 
 
 def _clock(seen: Evidence) -> Iterator[Finding]:
     if seen.clock_kept:
-        yield Finding("clock", "ok", "this host's clock is kept")
+        yield Finding("clock", "ok", "this host's clock is synchronized")
     elif seen.clock_kept is False:
-        says = f"nothing keeps this host's clock, which says {shown(seen.at)}"
-        needs = "dates of bookings, the journal and certificates go by it"
+        says = f"this host's clock is not synchronized; it shows {shown(seen.at)}"
+        needs = "bookings, the journal and certificates depend on it"
         yield Finding("clock", "note", says, f"{needs}; start a time service (timedatectl)")
     for host, ahead in sorted(seen.clocks.items()):
         yield Finding("clock", "note", clock_words(host, ahead), "set it (timedatectl)")
@@ -405,7 +411,7 @@ def _open(seen: Evidence) -> Iterator[Finding]:
     fleet = _the_fleet(seen)
     if fleet.security is None:
         roles = "roles are advisory and " if fleet.access.ranks else ""
-        says = f"a plain mesh: {roles}whoever reaches it can drive every device and end every hold"
+        says = f"a plain mesh: {roles}anyone who reaches it can drive every device and end every hold"
         yield Finding("open", "note", says, f"{SECURE} closes it")
 
 

@@ -1,4 +1,4 @@
-"""`zscout history`: who held what, from the journals of the candidates."""
+"""`zscout history`: past holds, from the journals of the candidates."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ COLUMNS = (
 
 
 def parse_arc(text: str, option: str) -> str:
-    """The name or id of an ARC. Raises BadInput."""
+    """Check the name or id of an ARC. Raises BadInput."""
     if not 1 <= len(text) <= MAX_ARC_NAME:
         raise BadInput(f"{option}: {quoted(text)} can't be the name of a request; write 1 to {MAX_ARC_NAME} characters")
     return text
@@ -35,9 +35,11 @@ ARC = common.Parsed("text", parse_arc)
 @click.option("--user", "users", type=journals.WHO, multiple=True, help="Only holds of this user, person or host.")
 @click.option("--group", help="Only holds of this group of the fleet file.")
 @click.option("--arc", type=ARC, help="Only holds of this request: its name or id.")
-@click.option("--since", type=journals.PAST, help="Leave out holds that ended before: a time ago (7d) or a date.")
-@click.option("--until", type=journals.PAST, default="0s", help="Leave out holds that began after.")
-@click.option("--limit", type=click.IntRange(1, MAX_LIMIT), default=100, show_default=True, help="The latest so many.")
+@click.option("--since", type=journals.PAST, help="Leave out holds that ended before this time: 7d ago, or a date.")
+@click.option("--until", type=journals.PAST, default="0s", help="Leave out holds that began after this time.")
+@click.option(
+    "--limit", type=click.IntRange(1, MAX_LIMIT), default=100, show_default=True, help="List only the latest holds."
+)
 @journals.formats
 @common.runs
 async def history(
@@ -55,13 +57,13 @@ async def history(
     """List past and present holds, newest last: holder, devices, duration, and how each ended. With DEVICE, a name or
     a pattern, only holds of that device.
 
-    Every node that may lead keeps a journal; all journals are asked, and a hold in several of them is shown once.
-    Times are by the clocks of those hosts. Lines name the times for which no journal is complete. A hold granted in
-    the last second may be missing, and a request that never held anything is not listed.
+    Every node that may lead keeps a journal; the command asks all of them, and shows a hold in several journals once.
+    Times are by the clocks of those hosts. A line names each interval for which no journal is complete. A hold granted
+    in the last second may be missing, and a request that never held a device is not listed.
 
-    --json and --csv have `used`: for how many seconds each device was used, from the beginning of the first command
-    that it carried out under the hold (or picture that it published) to the end of the last; for a direct hold all of
-    it. It is null, or empty, if the device did not report it. `used_rc_seconds` is the sum.
+    --json and --csv have `used`: the seconds for which each device was used, from the beginning of the first command
+    that it carried out under the hold (or picture that it published) to the end of the last; for a direct hold its
+    whole duration. It is null, or empty, if the device did not report it. `used_rc_seconds` is the sum.
 
     \b
     Examples:
@@ -78,23 +80,23 @@ async def history(
     who = journals.names_of(common.the_fleet(), users, group)
     async with common.connected("history", need_rcm=False) as client:
         asked = HistoryAsk(arc=arc, rc=rc, who=who, since=since, until=until)
-        told = await journals.ask_journals(client, asked, limit)
+        answer = await journals.ask_journals(client, asked, limit)
         fleet = client.fleet
     now = time.time()
     if as_json:
-        holds = [journals.hold_json(hold, now) for hold in told.holds]
-        terminal.print_json(journals.as_json(told, fleet.name, holds=holds))
+        holds = [journals.hold_json(hold, now) for hold in answer.holds]
+        terminal.print_json(journals.as_json(answer, fleet.name, holds=holds))
     elif as_csv:
-        journals.print_csv(COLUMNS, (_cells(hold, now) for hold in told.holds))
-        journals.print_remarks(told, err=True)
+        journals.print_csv(COLUMNS, (_cells(hold, now) for hold in answer.holds))
+        journals.print_remarks(answer, err=True)
     else:
-        title = f"Holds since {journals.local(told.window.began)}"
-        title += f", the latest {limit}: see --limit" if told.more else ""
-        if not told.holds:
-            terminal.print_line(f"no holds since {journals.local(told.window.began)}")
+        title = f"Holds since {journals.local(answer.window.began)}"
+        title += f", the latest {limit}: see --limit" if answer.more else ""
+        if not answer.holds:
+            terminal.print_line(f"no holds since {journals.local(answer.window.began)}")
         else:
-            journals.holds_table(title, told, told.holds, proven=fleet.security is not None).print()
-        journals.print_remarks(told)
+            journals.holds_table(title, answer, answer.holds, proven=fleet.security is not None).print()
+        journals.print_remarks(answer)
 
 
 def _cells(hold: PastHold, now: float) -> tuple[object, ...]:

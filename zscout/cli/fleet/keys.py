@@ -1,4 +1,4 @@
-"""`zscout doctor --keys`: what is alive on the mesh, and the key expressions that each serves."""
+"""`zscout doctor --keys`: the participants on the mesh, and the key expressions that each serves."""
 
 from __future__ import annotations
 
@@ -50,30 +50,30 @@ async def show_keys(*, as_json: bool) -> None:
 
 
 def served(own: Keys, token: Token, sharable: set[str] | None) -> list[dict[str, Any]]:
-    """The keys behind a token: `how` is query (it answers), put (it publishes) or hear (it subscribes). `sharable`
-    names the RCs that vote; None where nobody knows, so that all may. On a secured fleet people ask under their names.
-    """
+    """Return the keys of the participant with this token. `how`: query (it answers), put (it publishes) or hear (it
+    subscribes). `sharable`: the RCs that vote; None: unknown, any may. On a secured fleet keys of queries have the
+    asker's name."""
     match token.role:
         case Role.RCM:
             found = [
                 ("query", own.schedule_any, "request, cancel, release, hand over, book, unbook, slots"),
-                ("query", own.rcm_state_any if own.closed else own.rcm_state, "who holds, who waits and why"),
-                ("query", own.rcm_bookings_any if own.closed else own.rcm_bookings, "what is booked"),
+                ("query", own.rcm_state_any if own.closed else own.rcm_state, "holds, and the queue with reasons"),
+                ("query", own.rcm_bookings_any if own.closed else own.rcm_bookings, "bookings"),
                 ("put", own.grants, "holders of each device touched, revocations, heartbeat"),
-                ("put", own.notice_any, "what becomes of each request, to its client"),
+                ("put", own.notice_any, "the changes of each request, to its client"),
                 ("query", own.rank_any if own.closed else own.rank, "the best hosts for a component"),
                 ("query", own.served_placer()[0], "place, stop, migrate, drain, uncordon, list"),
-                ("put", own.placements, "how components stand, at each change"),
+                ("put", own.placements, "states of components, at each change"),
             ]
         case Role.NODE:
             [named, *_] = own.served_component(token.host)
             found = [("query", named, "components here: start, stop, list, logs, move")]
         case Role.RC:
             found = [
-                ("query", own.command_any(token.name), "do this, under a grant"),
+                ("query", own.command_any(token.name), "commands, under a grant"),
                 ("query", (own.asked_state_any if own.closed else own.rc_state)(token.name), "holders, term, health"),
                 ("put", own.rc_state(token.name), "the same, at each change"),
-                ("hear", own.grants, "who holds it from now on"),
+                ("hear", own.grants, "its holders from now on"),
             ]
             if sharable is None or token.name in sharable:
                 found.insert(0, ("query", own.vote(token.name), "would it carry these holders"))
@@ -83,10 +83,10 @@ def served(own: Keys, token: Token, sharable: set[str] | None) -> list[dict[str,
             sender = Sender(token.host, token.name)
             found = [
                 ("query", own.requests(sender), "its open requests"),
-                ("hear", own.notice(sender), "what becomes of them"),
+                ("hear", own.notice(sender), "their changes"),
             ]
         case Role.CANDIDATE | Role.RECORDER:
-            found = [("hear", own.grants, "who holds what"), ("hear", own.placements, "how components stand")]
+            found = [("hear", own.grants, "holders of all devices"), ("hear", own.placements, "states of components")]
             if token.role == Role.CANDIDATE:
                 found.append(("query", own.history_any(token.host), "holds that are over, if it keeps a journal"))
                 found.append(("query", own.bookings(token.host), "bookings that it keeps"))
@@ -98,11 +98,11 @@ def served(own: Keys, token: Token, sharable: set[str] | None) -> list[dict[str,
 def _print(own: Keys, tokens: list[Token], links: int, sharable: set[str] | None) -> None:
     terminal.print_line(f"Fleet {own.fleet}: {len(tokens)} alive, {links} links; all keys lie under {own.base}/")
     rows: list[tuple[str, ...]] = []
-    # Two lives of one name are two tokens, and serve the same keys.
+    # Two instances of one name have two tokens, and serve the same keys.
     for token in {token[:3]: token for token in tokens}.values():
         keys = served(own, token, sharable) or [{"how": "-", "key": "-", "what": "it is alive"}]
         for number, key in enumerate(keys):
-            # People see at once whom a key belongs to; programs want it on each line.
+            # At a terminal only the first key of a participant has its name; programs need it on each line.
             who = token[:3] if number == 0 or not terminal.at_terminal() else ("", "", "")
             rows.append((*who, key["how"], key["key"].removeprefix(f"{own.base}/"), key["what"]))
     terminal.print_line("")

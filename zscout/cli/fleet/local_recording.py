@@ -39,7 +39,7 @@ def _owner(recorded: Recorded) -> int | None:
     path = Path(recorded.file)
     if path.suffix != ".rrd" or not path.is_absolute():
         return None
-    # A link is not followed, a pipe not waited for.
+    # Don't follow a link, and don't block on a pipe.
     opened = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
     try:
         found = os.fstat(opened)

@@ -1,4 +1,4 @@
-"""The part of a fleet that `zscout status NAME...` shows: what has these names, and what it is linked to."""
+"""The part of a fleet that `zscout status NAME...` shows: everything with these names, and everything linked to it."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ class Selection:
 
 
 def _glob(name: str) -> str:
-    """A need's pattern (`robot/scout$*`) or a shell's, without the latter's other signs."""
+    """Convert a need's pattern (`robot/scout$*`) to a shell's, with `*` as the only special character."""
     return name.replace("$*", "*").replace("[", "[[]").replace("?", "[?]")
 
 

@@ -1,4 +1,4 @@
-"""`zscout usage`: accounts of who held and used what for how long, from the journals of the candidates."""
+"""`zscout usage`: hold and use times by user, group or device, from the journals of the candidates."""
 
 from __future__ import annotations
 
@@ -17,34 +17,35 @@ from zscout.services.journal.asking import FleetHistory
 from zscout.terminal import Table, span
 
 MAX_HOLDS = 200_000
-"""That are added up; of more the latest."""
+"""Holds that are summed up, the latest."""
 NO_GROUP = "(no group)"
 MAX_NAMED = 8
-"""Accounts of which one line tells what is not known."""
+"""Accounts named in the remark on unknown use."""
 
 
 @click.command()
-@click.option("--by", type=click.Choice(["user", "group", "rc"]), default="user", show_default=True, help="Accounts.")
-@click.option("--since", type=journals.PAST, default="7d", show_default=True, help="A time ago (7d) or a date.")
-@click.option("--until", type=journals.PAST, default="0s", help="A time ago or a date. Default: now.")
+@click.option(
+    "--by", type=click.Choice(["user", "group", "rc"]), default="user", show_default=True, help="Sum up by this."
+)
+@click.option("--since", type=journals.PAST, default="7d", show_default=True, help="Begin: 7d ago, or a date.")
+@click.option("--until", type=journals.PAST, default="0s", help="End: 1d ago, or a date. Default: now.")
 @journals.formats
 @common.runs
 async def usage(by: str, since: float, until: float, as_json: bool, as_csv: bool) -> None:
-    """Sum up hold times, and how much of them was used. Only times within --since and --until count; --json and
-    --csv print seconds.
+    """Sum up hold times, and the used part of them, between --since and --until. --json and --csv print seconds.
 
     \b
-    HOLDS        number of holds within the time
+    HOLDS        number of holds in this interval
     HELD         their duration; two holds at one time count twice
     DEVICE TIME  the same for each device: 3 devices for 10 s are 30 s
-    USED         how much of that: at each device from the beginning of the first command of a hold
-                 (or picture that it published) to the end of the last; for a direct hold all of it
-    WAITED       time in the queue before holds that began within it; requests that never held anything are unknown
+    USED         the used part of it: at each device from the beginning of the first command of a hold
+                 (or picture that it published) to the end of the last; for a direct hold its whole duration
+    WAITED       time in the queue of holds that began in this interval; requests that never held a device are unknown
     PREEMPTED    holds taken for another request before their minimum runtime was over, and their duration
     THROWN AWAY  duration of holds that ended before their minimum runtime, preempted or lost
 
-    A user is the name of the certificate in a secured fleet, else the name that programs give; a member of several
-    groups is counted in each. Use that devices did not report is not counted; a line says for how many holds.
+    In a secured fleet the user is the name of the certificate, else the name that programs give; a member of several
+    groups is counted in each. Use that devices did not report is not counted; a line gives the number of such holds.
 
     \b
     Examples:
@@ -56,17 +57,19 @@ async def usage(by: str, since: float, until: float, as_json: bool, as_csv: bool
     journals.check_window(since, until)
     keys = _keys(common.the_fleet(), by)
     async with common.connected("usage", need_rcm=False) as client:
-        told = await journals.ask_journals(client, HistoryAsk(since=since, until=until), MAX_HOLDS)
-    found = accounts(told.holds, keys, told.window, by_rc=by == "rc")
+        answer = await journals.ask_journals(client, HistoryAsk(since=since, until=until), MAX_HOLDS)
+    found = accounts(answer.holds, keys, answer.window, by_rc=by == "rc")
     names = [field.name for field in fields(Account)]
     if as_json:
-        terminal.print_json(journals.as_json(told, client.fleet.name, by=by, accounts=[_rounded(one) for one in found]))
+        terminal.print_json(
+            journals.as_json(answer, client.fleet.name, by=by, accounts=[_rounded(account) for account in found])
+        )
     elif as_csv:
-        journals.print_csv([by, *names[1:]], ([*_rounded(one).values()] for one in found))
-        _print_remarks(told, found, err=True)
+        journals.print_csv([by, *names[1:]], ([*_rounded(account).values()] for account in found))
+        _print_remarks(answer, found, err=True)
     else:
-        _table(found, by, told).print()
-        _print_remarks(told, found)
+        _table(found, by, answer).print()
+        _print_remarks(answer, found)
 
 
 def _keys(fleet: Fleet, by: str) -> Callable[[PastHold], Iterable[str]]:
@@ -85,31 +88,31 @@ def _rounded(account: Account) -> dict[str, object]:
     return {name: round(value, 3) if isinstance(value, float) else value for name, value in asdict(account).items()}
 
 
-def _table(found: list[Account], by: str, told: FleetHistory) -> Table:
+def _table(found: list[Account], by: str, answer: FleetHistory) -> Table:
     rows = [
         (
-            *(one.key, str(one.holds), span(one.held), span(one.rc_seconds)),
-            *("?" if one.used is None else span(one.used), span(one.waited)),
-            f"{one.preempted} ({span(one.preempted_seconds)})" if one.preempted else "-",
-            span(one.thrown_away) if one.thrown_away else "-",
+            *(account.key, str(account.holds), span(account.held), span(account.rc_seconds)),
+            *("?" if account.used is None else span(account.used), span(account.waited)),
+            f"{account.preempted} ({span(account.preempted_seconds)})" if account.preempted else "-",
+            span(account.thrown_away) if account.thrown_away else "-",
         )
-        for one in found
+        for account in found
     ]
     columns = (by.upper(), "HOLDS", "HELD", "DEVICE TIME", "USED", "WAITED", "PREEMPTED", "THROWN AWAY")
-    title = f"Usage from {journals.local(told.window.began)} to {journals.local(told.window.ended)}"
+    title = f"Usage from {journals.local(answer.window.began)} to {journals.local(answer.window.ended)}"
     return Table(title, columns, rows)
 
 
 def _unknown_use(found: list[Account]) -> str:
-    some = [f"{one.key} {one.used_unknown} of {one.holds}" for one in found if one.used_unknown]
+    some = [f"{account.key} {account.used_unknown} of {account.holds}" for account in found if account.used_unknown]
     more = f", and {len(some) - MAX_NAMED} more" if len(some) > MAX_NAMED else ""
     words = "holds whose devices did not all report their use, which is not counted"
     return f"{words}: {', '.join(some[:MAX_NAMED])}{more}" if some else ""
 
 
-def _print_remarks(told: FleetHistory, found: list[Account], *, err: bool = False) -> None:
+def _print_remarks(answer: FleetHistory, found: list[Account], *, err: bool = False) -> None:
     if words := _unknown_use(found):
         click.secho(terminal.clean(words), fg="yellow", err=err)
-    if told.more:
+    if answer.more:
         click.secho(f"only the latest {MAX_HOLDS} holds are counted; ask for less time", fg="yellow", err=err)
-    journals.print_remarks(told, err=err)
+    journals.print_remarks(answer, err=err)

@@ -1,7 +1,7 @@
-"""`zscout view`: a recording, or the fleet live, in the Rerun viewer: its own window, or a browser's.
+"""`zscout view`: show a recording, or the fleet live, in the Rerun viewer: in its own window, or in a browser.
 
-Where a node of this host records, what it records is shown, its past too; elsewhere a recorder is started. Viewer and
-recorder are processes beside the command: they end with it, however it ends."""
+If a node of this host records, its recording is shown, including its past; otherwise a recorder is started. Viewer and
+recorder are processes of their own that end with the command, however it ends."""
 
 from __future__ import annotations
 
@@ -41,28 +41,28 @@ if TYPE_CHECKING:
 
 WEB_PORT: Final = 9090
 PAGE: Final = "renderer=webgl&hide_welcome_screen=1&theme=dark"
-"""What the page's address asks for. On the light theme, which a browser may prefer, names are pale on pale."""
+"""Query of the page's address. The light theme, which a browser may prefer, shows names pale on pale."""
 HOSTING: Final = "Hosting a web-viewer at"
-START: Final = 20.0
-"""Seconds within which a recorder or a viewer has come up, on a busy machine."""
-GRACE: Final = 40.0
-"""Seconds for a child to end by itself: the recorder finishes its file."""
-LOOK_FOR_RECORDER: Final = 1.0
-"""Seconds in which a recorder tells where it records."""
-LOOKS_FOR_RECORDER: Final = 5
-LOOK_AGAIN: Final = 0.2
-"""Seconds between two of these."""
-CONNECT: Final = 1.0
+START_TIMEOUT_S: Final = 20.0
+"""Start of a recorder or a viewer, on a busy machine."""
+END_TIMEOUT_S: Final = 40.0
+"""Time for a child to end by itself: the recorder finishes its file."""
+FIND_RECORDER_S: Final = 1.0
+"""Timeout of one query for recorders."""
+FIND_RECORDER_TRIES: Final = 5
+FIND_RECORDER_DELAY_S: Final = 0.2
+"""Pause between two such queries."""
+CONNECT_TIMEOUT_S: Final = 1.0
 MAX_LINE: Final = 65_536
-KEPT: Final = 20
-"""Last lines of a child's log that are kept, to say why it failed."""
-WINDOW: Final = ("--bind", "127.0.0.1", "--port", "auto", "--hide-welcome-screen")
-"""What a viewer with a window of its own is given."""
+KEPT_LINES: Final = 20
+"""Last lines of a child's log that are kept, to explain a failure."""
+WINDOW_ARGUMENTS: Final = ("--bind", "127.0.0.1", "--port", "auto", "--hide-welcome-screen")
+"""Arguments of a viewer with a window of its own."""
 _COLOURS: Final = re.compile(r"\x1b\[[0-9;]*m")
 
 
 def parse_recorded_past(text: str, option: str) -> Ns:
-    """Raises BadInput."""
+    """Parse a duration. Raises BadInput."""
     found = parse_duration(text)
     if found is None or found > MAX_PAST:
         raise BadInput(f"{option}: {quoted(text)} is not a duration up to {MAX_PAST // 86_400}d; write {DURATIONS}")
@@ -101,10 +101,10 @@ async def view(
 ) -> None:
     """Open the recording FILE (.rrd), or show the fleet live.
 
-    If a node of this host records (table [recorder] in its file), its recording is shown with its past; else the
-    fleet is recorded from now on, and earlier holds come from the journals. The viewer is a window of its own;
-    closing it ends the command. On a host without a display use --web. Ctrl-C ends everything that was started, and
-    completes a recording that was started here.
+    If a node of this host records (table [recorder] in its file), its recording is shown with its past; otherwise
+    the fleet is recorded from now on, and earlier holds come from the journals. The viewer opens a window; closing it
+    ends the command. On a host without a display use --web. Ctrl-C ends everything that the command started, and
+    completes its recording.
 
     \b
     Examples:
@@ -121,7 +121,7 @@ async def view(
         file = _checked(file)
     if not web and not has_display():
         raise common.Failed("there is no display (neither DISPLAY nor WAYLAND_DISPLAY is set); use --web and a browser")
-    # The page comes last, so what it shows needs its own port first.
+    # Choose the port of the live stream first: the page, which is served last, connects to it.
     async with _source(file, bind, None if web else port, out, past) as (recording, recorder):
         if not as_json and file is None:
             terminal.print_line(f"{'Recording to' if recorder is not None else 'A node records to'} {recording.file}")
@@ -133,32 +133,32 @@ async def view(
                 terminal.print_line(f"Open {address}")
                 terminal.print_line("Ctrl-C ends")
             children = [window] + ([recorder] if recorder is not None else [])
-            ended = await common.first_of(*(one.process.wait() for one in children))
-            for one, over in zip(children, ended, strict=True):
-                # The viewer may be closed.
-                if over and (one is not window or one.process.returncode != 0):
-                    raise await one.failed()
+            ended = await common.first_of(*(child_.process.wait() for child_ in children))
+            for child_, over in zip(children, ended, strict=True):
+                # The user may close the viewer.
+                if over and (child_ is not window or child_.process.returncode != 0):
+                    raise await child_.failed()
 
 
 @asynccontextmanager
 async def open_viewer(
     recording: Recording, *, web: bool, bind: str = "127.0.0.1", port: int | None = None, stream: int = 0
 ) -> AsyncIterator[tuple[Child, str | None]]:
-    """A viewer that has the recording open, live if it has a `url`; and with `web`, once it is served, the address of
-    the page, on this `port` or any. A file is served to the page on the port `stream`, 0 for any. Raises BadInput and
-    Failed where it can't be."""
+    """Open a viewer with the recording, live if it has a `url`. Yield the viewer, and with `web` the address of the
+    page as soon as it is served. port: of the page; None: any. stream: port on which a file is served to the page; 0:
+    any. Raises BadInput, Failed."""
     shown = recording.url or recording.file
     if not web:
-        async with viewer(*WINDOW, *(["--connect"] if recording.url is not None else []), shown) as window:
+        async with viewer(*WINDOW_ARGUMENTS, *(["--connect"] if recording.url is not None else []), shown) as window:
             yield window, None
         return
     page = serving_port(bind, port) if port is not None else serving_port(bind, WEB_PORT, 0)
-    # A recording that is live elsewhere needs nothing of this viewer but its files.
+    # For a live recording the viewer serves only its page's files.
     own = bind if recording.url is None else "127.0.0.1"
     stream, files = serving_port(own, stream), serving_port(own, 0)
     ports = ("--web-viewer-port", str(files), "--port", str(stream))
     async with viewer("--serve-web", "--bind", own, *ports, shown, log="info") as window:
-        await window.says(HOSTING)
+        await window.logged(HOSTING)
         source = recording.url or f"rerun+http://{_host(bind)}:{stream}/proxy"
         source = source.replace(f"//{_bracketed(bind)}:", f"//{_host(bind)}:")
         here = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(own, own)  # noqa: S104 - to reach it
@@ -170,7 +170,7 @@ async def open_viewer(
             except OSError:
                 if port is not None:
                     raise
-                # Another program took it since it was found free: any other does as well.
+                # Another program took the port since it was found free: use any other.
                 page = serving_port(bind, 0)
                 served = ViewerPage((here, files), allowed, bind, page)
                 await served.start()
@@ -186,7 +186,7 @@ async def open_viewer(
 async def _source(
     file: Path | None, bind: str, port: int | None, out: Path, past: int | None
 ) -> AsyncIterator[tuple[Recording, Child | None]]:
-    """What the viewer opens, and the recorder behind it where one was started."""
+    """Yield the recording for the viewer, and the recorder if one was started."""
     from zscout.behaviors.client.identity import host_of
 
     if file is not None:
@@ -196,7 +196,7 @@ async def _source(
     joined, alone = await _recorded_here(fleet, bind)
     if joined is not None:
         if past is not None:
-            terminal.print_line("zscout: --past: a node records; its file sets what it shows of before", sys.stderr)
+            terminal.print_line("zscout: --past is ignored: a node records, with the past set in its file", sys.stderr)
         yield joined, None
         return
     host = host_of(fleet)
@@ -214,8 +214,8 @@ async def _source(
 
 
 async def _recorded_here(fleet: Fleet, bind: str) -> tuple[Recording | None, str]:
-    """What a node of this host records of the fleet, where it serves that for pages on `bind`. And a line where there
-    is no RCM: then a view is empty, and may fill later."""
+    """Find the recording of a node of this host that pages on `bind` can show; None if there is none. The second
+    result is a line to print if there is no RCM: the view is empty, and may fill later."""
     from zscout.messages import Recorded, RecordedAsk
 
     async with common.connected("view", fleet, need_rcm=False) as client:
@@ -225,8 +225,8 @@ async def _recorded_here(fleet: Fleet, bind: str) -> tuple[Recording | None, str
         except common.NobodyThere as error:
             alone = str(error)
         mesh = client.mesh
-        for _ in range(LOOKS_FOR_RECORDER):
-            replies = await mesh.ask(mesh.keys.recorded_any, RecordedAsk(), Recorded, timeout=LOOK_FOR_RECORDER)
+        for _ in range(FIND_RECORDER_TRIES):
+            replies = await mesh.ask(mesh.keys.recorded_any, RecordedAsk(), Recorded, timeout=FIND_RECORDER_S)
             for reply in replies:
                 if reply.message is None or not _is_node(fleet, mesh.keys.sender_of(reply.key).host):
                     continue
@@ -234,24 +234,24 @@ async def _recorded_here(fleet: Fleet, bind: str) -> tuple[Recording | None, str
                     return recording, ""
             if alone:
                 break
-            # Links come one after the other: that to a recorder of this host may be the last.
-            await asyncio.sleep(LOOK_AGAIN)
+            # Links are made one after the other: the link to a recorder of this host may be the last.
+            await asyncio.sleep(FIND_RECORDER_DELAY_S)
     return None, alone
 
 
 def _is_node(fleet: Fleet, host: str) -> bool:
-    """Return True if the answer of this host may be that of a node; a plain mesh proves nothing."""
+    """Return True if this host has the rights of a node; on a plain mesh always."""
     return fleet.security is None or bool(fleet.access.ranks_of(host) & NODES)
 
 
 async def _reached(recorded: Recorded, bind: str) -> Recording | None:
-    """The recording, if a recorder of this host writes and serves it. `bind` is where the page is served: whoever
-    opens that must reach the live view as well."""
+    """Return the recording if a recorder of this host writes and serves it. `bind`: address of the page; browsers that
+    open it must reach the live stream as well."""
     address = await asyncio.to_thread(local_address, recorded, bind)
     if address is None:
         return None
     try:
-        async with asyncio.timeout(CONNECT):
+        async with asyncio.timeout(CONNECT_TIMEOUT_S):
             _, writer = await asyncio.open_connection(address, recorded.port)
     except OSError:
         return None
@@ -260,7 +260,7 @@ async def _reached(recorded: Recorded, bind: str) -> Recording | None:
 
 
 def _checked(file: Path) -> Path:
-    """The whole path of FILE, which may begin with a dash. Raises BadInput where it can't be a recording."""
+    """Return the absolute path of FILE, since a name may begin with a dash. Raises BadInput if it is no recording."""
     try:
         if not file.is_file():
             raise BadInput(f"{file}: there is no such file; recordings of nodes and of zscout view are in runs/")
@@ -269,14 +269,14 @@ def _checked(file: Path) -> Path:
     except OSError as error:
         raise BadInput(f"{file}: can't be read: {error.strerror}; check the path and its permissions") from None
     if begin != MAGIC:
-        raise BadInput(f"{file}: is not a Rerun recording; name a .rrd file")
+        raise BadInput(f"{file}: not a Rerun recording; name a .rrd file")
     if file.suffix != ".rrd":
         raise BadInput(f"{file}: the name does not end in .rrd; rename it")
     return file.absolute()
 
 
 def serving_port(bind: str, *ports: int) -> int:
-    """The first of these ports that is free, 0 for any. Raises BadInput where all are taken."""
+    """Return the first free port of `ports`; 0 means any. Raises BadInput if all are taken."""
     try:
         return free_port(bind, *ports)
     except OSError as error:
@@ -289,7 +289,7 @@ def _bracketed(address: str) -> str:
 
 
 def _host(bind: str) -> str:
-    """What a browser writes for an address that is served: this host's name where that is every address."""
+    """Return the host in a URL for `bind`: this host's name if `bind` means all addresses."""
     return socket.gethostname() if ipaddress.ip_address(bind).is_unspecified else _bracketed(bind)
 
 
@@ -297,16 +297,16 @@ def _host(bind: str) -> str:
 
 
 class Child:
-    """A process that was started here, and what it logs."""
+    """A child process and the end of its log."""
 
     def __init__(self, what: str, process: asyncio.subprocess.Process) -> None:
         self.what, self.process = what, process
-        self.lines: deque[str] = deque(maxlen=KEPT)
+        self.lines: deque[str] = deque(maxlen=KEPT_LINES)
         self._news = asyncio.Event()
         self._log = asyncio.create_task(self._read_log())
 
-    async def says(self, words: str) -> None:
-        """Returns once these words stand in its log. Raises Failed if it ends first, or takes too long."""
+    async def logged(self, words: str) -> None:
+        """Wait until its log has these words. Raises Failed if it ends first, or takes too long."""
         async with self._starting():
             while not any(words in line for line in self.lines):
                 if self._log.done():
@@ -315,26 +315,28 @@ class Child:
                 await self._news.wait()
 
     async def recording(self) -> Recording:
-        """What a recorder says when it records. Raises BadInput and Failed where it can't."""
+        """Wait until the recorder records; return where. Raises BadInput, Failed."""
         assert self.process.stdout is not None  # noqa: S101
         async with self._starting():
             try:
                 return msgspec.json.decode(await self.process.stdout.readline(), type=Recording)
-            except ValueError:  # it ended before that
+            except ValueError:  # it ended before
                 raise await self.failed() from None
 
     @asynccontextmanager
     async def _starting(self) -> AsyncIterator[None]:
         try:
-            async with asyncio.timeout(START):
+            async with asyncio.timeout(START_TIMEOUT_S):
                 yield
         except TimeoutError:
-            raise common.Failed(f"{self.what} did not start within {START:g} s; is this host overloaded?") from None
+            raise common.Failed(
+                f"{self.what} did not start within {START_TIMEOUT_S:g} s; is this host overloaded?"
+            ) from None
 
     async def failed(self) -> Exception:
         code = await self.process.wait()
         await self._log
-        words = self.lines[-1] if self.lines else "without a word"
+        words = self.lines[-1] if self.lines else "it logged nothing"
         if self.process.stdout is not None and code == BAD_SETTINGS:
             return BadInput(words.partition(" ERROR ")[2] or words)
         return common.Failed(f"{self.what} ended (code {code}): {words}")
@@ -345,7 +347,7 @@ class Child:
         while True:
             try:
                 line = await stderr.readline()
-            except ValueError:  # longer than MAX_LINE: it is skipped
+            except ValueError:  # longer than MAX_LINE: skip it
                 continue
             if text := terminal.clean(_COLOURS.sub("", line.decode(errors="replace"))).strip():
                 self.lines.append(text)
@@ -363,7 +365,7 @@ class Child:
                 with suppress(ProcessLookupError):
                     process.terminate()
         try:
-            async with asyncio.timeout(GRACE):
+            async with asyncio.timeout(END_TIMEOUT_S):
                 await process.wait()
         except (TimeoutError, asyncio.CancelledError) as error:
             with suppress(ProcessLookupError):
@@ -379,8 +381,8 @@ class Child:
 async def child(
     what: str, command: Sequence[str], env: Mapping[str, str], *, job: bytes | None = None
 ) -> AsyncIterator[Child]:
-    """Starts a child that ends with this context, and with this process however that ends. It leads a session of its
-    own: Ctrl-C reaches only us, and we end it in order."""
+    """Start a child that ends with this context, and with this process however that ends. The child has a session of
+    its own: Ctrl-C reaches only this process, which then ends the child in order."""
     pipe = asyncio.subprocess.PIPE
     process = await asyncio.create_subprocess_exec(
         *LAUNCH,
@@ -404,8 +406,8 @@ async def child(
 
 @asynccontextmanager
 async def viewer(*arguments: str, log: str = "error") -> AsyncIterator[Child]:
-    """Starts the Rerun viewer, which reports nothing; `log` is its level. Raises Failed where it is not installed."""
-    # The viewer itself: the `rerun` script only wraps it, and killing the script would orphan it.
+    """Start the Rerun viewer without its usage reports. `log`: its log level. Raises Failed if it is not installed."""
+    # Start the binary: the `rerun` script only wraps it, and killing the script would orphan the viewer.
     spec = find_spec("rerun_cli")
     binary = Path(spec.origin).with_name("rerun") if spec is not None and spec.origin is not None else None
     if binary is None or not os.access(binary, os.X_OK):

@@ -1,7 +1,8 @@
 """The Rerun viewer without its calls home: its page as zscout serves it, and the settings of its process.
 
 Rerun's page loads a font from the internet, and its program reports usage and asks GitHub for newer versions. Here the
-page may connect to the recording alone, and the process finds analytics switched off and no way out for HTTPS."""
+page may connect to the recording alone, and the process has analytics switched off and an HTTPS proxy that leads
+nowhere."""
 
 from __future__ import annotations
 
@@ -39,7 +40,7 @@ def silent(folder: Path) -> Mapping[str, str]:
 
 
 class ViewerPage(PlainHttpServer):
-    """The page of the viewer that serves it on `source`, with `stream` as the one address that it may connect to."""
+    """Serves the page of the viewer at `source` with a policy that lets it connect to `stream` alone."""
 
     where = "the viewer is at /"
     timeout = 120.0

@@ -1,4 +1,4 @@
-"""A line and tables, shown once, or with `--watch` again and again."""
+"""A headline and tables, printed once, or updated with `--watch`."""
 
 from __future__ import annotations
 
@@ -18,15 +18,14 @@ from zscout.terminal import Line, Table
 if TYPE_CHECKING:
     from rich.console import Group
 
-EVERY: Final = 1.0
-"""Seconds between two refreshes."""
-HASTE: Final = 0.1
-"""The same after a change."""
+REFRESH_INTERVAL_S: Final = 1.0
+MIN_REFRESH_INTERVAL_S: Final = 0.1
+"""Interval while changes arrive."""
 MAX_ROWS: Final = 500
 """Rows of one table at a terminal."""
-USUAL: Final = 24
+USUAL_HEIGHT: Final = 24
 """Lines of the usual terminal."""
-PASSING: Final = frozenset(
+VOLATILE_FIELDS: Final = frozenset(
     {
         "held",
         "remaining",
@@ -48,9 +47,9 @@ PASSING: Final = frozenset(
 
 
 STEPS: Final = {b"\x1b[A": -1, b"\x1b[B": 1, b"\x1bOA": -1, b"\x1bOB": 1, b"k": -1, b"j": 1}
-"""Lines by which these keys scroll: arrows, and as in `less`."""
+"""Lines to scroll by key: arrows, and as in `less`."""
 PAGES: Final = {b"\x1b[5": -1, b"\x1b[6": 1, b"b": -1, b" ": 1}
-"""The same in pages; the rest of an escape sequence is ignored."""
+"""Pages to scroll by key; the rest of an escape sequence is ignored."""
 ENDS: Final = {b"\x1b[H": 0, b"g": 0, b"\x1b[F": 1_000_000, b"G": 1_000_000}
 
 
@@ -74,13 +73,13 @@ class Overview:
                 table.print()
 
     def lines(self, width: int) -> list[Line]:
-        """For a terminal of this width, the headline first; blank lines divide the tables where all of it then fits a
-        terminal of the usual height."""
+        """Return the lines for a terminal of this width, the headline first. Blank lines divide the tables if the whole
+        then fits a terminal of the usual height."""
         style = "bold red" if self.alarm else "bold"
         lines = [(line, style) for line in terminal.wrapped(terminal.clean(self.headline), width)]
         tables = [table for table in self.tables if table.rows]
         blocks = [table.fitted(width, MAX_ROWS) for table in tables]
-        divided = len(lines) + sum(len(block) + 1 for block in blocks) <= USUAL
+        divided = len(lines) + sum(len(block) + 1 for block in blocks) <= USUAL_HEIGHT
         for table, block in zip(tables, blocks, strict=True):
             lines += [("", ""), *block] if divided else block
             if (more := len(table.rows) - MAX_ROWS) > 0:
@@ -89,8 +88,8 @@ class Overview:
 
 
 class Scrolled:
-    """The part of an overview that fits a terminal: its headline, as many lines of its tables as there is room for,
-    starting at the line that keys have chosen, and a hint."""
+    """The part of an overview that fits a terminal: its headline, lines of its tables from the line that keys have
+    chosen, and a hint."""
 
     def __init__(self) -> None:
         self._first = self._last = 0
@@ -110,7 +109,7 @@ class Scrolled:
     def picture(self, overview: Overview) -> Group:
         console = terminal.console()
         head, *lines = overview.lines(console.width)
-        # The last line of a terminal is left to the cursor.
+        # The cursor needs the last line of a terminal.
         self._room = max(1, console.height - 3)
         self._last = max(0, len(lines) - self._room)
         self._first = min(self._first, self._last)
@@ -135,8 +134,8 @@ class Displayed(Protocol):
 async def show(
     shown: Displayed, news: asyncio.Event, refresh: Callable[[], Awaitable[None]], *, watch: bool, as_json: bool
 ) -> None:
-    """Show it once; with `watch` again after news and each second, after a `refresh`, until the user presses q: in
-    place at a terminal, in a pipe as a block if more has changed than loads and spans of time."""
+    """Show `shown` once. With `watch`, refresh and show it after news and each second, until the user presses q: in
+    place at a terminal, in a pipe as another block if fields changed that are not volatile."""
     stop = asyncio.Event()
     printed: Any = None
     scrolled = Scrolled()
@@ -163,25 +162,25 @@ async def show(
             elif live.watched:
                 drawn = shown.overview()
                 live.draw(scrolled.picture(drawn))
-            elif (now := lasting(shown.as_object())) != printed:
+            elif (now := without_volatile(shown.as_object())) != printed:
                 if printed is not None:
                     terminal.print_line("")
                 shown.overview().print()
                 printed = now
             if not watch:
                 return
-            await done_within(EVERY, news.wait())
-            await done_within(HASTE, stop.wait())
+            await done_within(REFRESH_INTERVAL_S, news.wait())
+            await done_within(MIN_REFRESH_INTERVAL_S, stop.wait())
             news.clear()
             await refresh()
 
 
-def lasting(value: Any) -> Any:
-    """A JSON value without the fields that change all the time."""
+def without_volatile(value: Any) -> Any:
+    """Return a JSON value without the fields that change all the time."""
     if isinstance(value, msgspec.Struct):
         value = msgspec.structs.asdict(value)
     if isinstance(value, dict):
-        known = {key: item for key, item in value.items() if key not in PASSING}
-        # By host, for how long.
-        return {key: sorted(item) if key == "unseen" else lasting(item) for key, item in known.items()}
-    return [lasting(item) for item in value] if isinstance(value, list) else value
+        known = {key: item for key, item in value.items() if key not in VOLATILE_FIELDS}
+        # `unseen` maps hosts to durations.
+        return {key: sorted(item) if key == "unseen" else without_volatile(item) for key, item in known.items()}
+    return [without_volatile(item) for item in value] if isinstance(value, list) else value

@@ -144,7 +144,7 @@ async def _stream(
     stack: AsyncExitStack, robot: str, record: Path | None, console: _Console, *, view: bool
 ) -> PictureRecording:
     """The picture's stream, and a window onto it where there is a display."""
-    from zscout.cli.fleet.view import WINDOW, has_display, viewer
+    from zscout.cli.fleet.view import WINDOW_ARGUMENTS, has_display, viewer
     from zscout.ports import free_port
 
     # Rerun takes seconds to load on a busy machine, and the operator may be in a hurry.
@@ -156,7 +156,7 @@ async def _stream(
     words = f"picture at {stream.url}" if window else f"see the picture with: rerun {stream.url}"
     console.event("picture", words, url=stream.url)
     if window:
-        await stack.enter_async_context(viewer(*WINDOW, "--connect", stream.url))
+        await stack.enter_async_context(viewer(*WINDOW_ARGUMENTS, "--connect", stream.url))
     return stream
 
 

@@ -1,4 +1,4 @@
-"""`zscout demo`: what zscout does, on a live mesh on this machine."""
+"""`zscout demo`: demonstrations on a live mesh on this machine."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 @click.group(cls=DefaultGroup, default="robots")
 def demo() -> None:
-    """Show what zscout does on a live mesh on this machine; `robots` unless another one is named.
+    """Show what zscout does on a live mesh on this machine. Default: robots.
 
     \b
     Examples:
@@ -41,8 +41,8 @@ def demo() -> None:
 
 
 class _Live:
-    """The Rerun viewer beside a demo: a window, or the server of a page for a browser. The page has one address for the
-    demo and its recording."""
+    """The Rerun viewer beside a demo: a window, or the server of a page for a browser. The page keeps its address when
+    the demo ends and its recording is shown."""
 
     def __init__(self, stack: AsyncExitStack, *, web: bool) -> None:
         self._stack, self._web = stack, web
@@ -75,10 +75,10 @@ class _Live:
 
 def live_options(command: F) -> F:
     command = click.option("--view", is_flag=True, help="Show it live in the Rerun viewer's window.")(command)
-    return click.option("--web", is_flag=True, help="Show it live in a browser: prints the address to open.")(command)
+    return click.option("--web", is_flag=True, help="Show it live in a browser; print the address to open.")(command)
 
 
-async def _played(web: bool, view: bool, play: Callable[[LiveView | None], Coroutine[Any, Any, int]]) -> int:
+async def _play_live(web: bool, view: bool, play: Callable[[LiveView | None], Coroutine[Any, Any, int]]) -> int:
     async with AsyncExitStack() as stack:
         return await play(_Live(stack, web=web) if web or view else None)
 
@@ -94,7 +94,10 @@ def _check_live(web: bool, view: bool) -> None:
 
 def recording_option(command: F) -> F:
     return click.option(
-        "--out", metavar="FILE", type=click.Path(path_type=Path), help="The recording. Default: runs/demo-….rrd"
+        "--out",
+        metavar="FILE",
+        type=click.Path(path_type=Path),
+        help="Write the recording here. Default: runs/demo-….rrd",
     )(command)
 
 
@@ -105,20 +108,22 @@ def recording_option(command: F) -> F:
     shell_complete=buildings,
     metavar="BUILDING",
     default="living_room",
-    help="As in zscout simulate: a name, a TOML file, or random:SEED.",
+    help="Use this building, as in zscout simulate: a name, a TOML file, or random:SEED.",
 )
 @click.option("--seed", type=click.IntRange(0), default=1, help="Seed of noise, slip and people.")
-@click.option("--speed", type=click.FloatRange(0.2, 4.0), default=1.5, help="Building's seconds per real second.")
+@click.option(
+    "--speed", type=click.FloatRange(0.2, 4.0), default=1.5, help="Seconds of the building in one real second."
+)
 @recording_option
 @live_options
 @common.json_option("Print the summary as one JSON object.")
 def robots(building: str, seed: int, speed: float, out: Path | None, web: bool, view: bool, as_json: bool) -> int:
-    """Hide the robots of a building in the dark, and have them watch.
+    """Let the robots of a building hide in the dark and watch.
 
-    It serves a simulated building with four robots, two framegrabbers and one radio, starts three nodes with these
-    devices on this machine, apart from every other fleet, and places a sensor net. Halfway an operator takes one robot,
-    drives it and gives it back. It ends when all robots are hidden and a person has walked by, or a minute of the
-    building later, after at most two and a half minutes. Only a recording is left, also after Ctrl-C.
+    The demo serves a simulated building with four robots, two framegrabbers and one radio, starts three nodes with
+    these devices on this machine, apart from every other fleet, and places a sensor net. Halfway an operator takes one
+    robot, drives it and releases it. The demo ends when all robots are hidden and a person has walked by, or a minute
+    of the building later, after at most two and a half minutes. Only a recording is left, also after Ctrl-C.
 
     \b
     Examples:
@@ -128,10 +133,10 @@ def robots(building: str, seed: int, speed: float, out: Path | None, web: bool, 
     """
     common.check_recording("--out", out)
     _check_live(web, view)
-    # Zenoh is loaded here: the help needs none of it.
+    # Import Zenoh only here: the help does not need it.
     from zscout.simulation.demo.robots_screen import play
 
-    return common.run(_played(web, view, lambda live: play(building, seed, speed, out, as_json=as_json, live=live)))
+    return common.run(_play_live(web, view, lambda live: play(building, seed, speed, out, as_json=as_json, live=live)))
 
 
 @demo.command()
@@ -141,9 +146,9 @@ def robots(building: str, seed: int, speed: float, out: Path | None, web: bool, 
 def table1(out: Path | None, web: bool, view: bool, as_json: bool) -> int:
     """Play Table 1 of the paper on a live mesh, and compare what happens with Table 2.
 
-    It starts three nodes with four devices and five programs on this machine, apart from every other fleet,
-    for about 25 seconds, and records them. Nothing is left but the recording. Exit code 1: not all came in
-    the order of Table 2; cells that are only late, on a busy machine, are named.
+    The demo starts three nodes with four devices and five programs on this machine, apart from every other fleet,
+    for about 25 seconds, and records them. Only the recording is left. Exit code 1: events came in another order
+    than in Table 2; cells that are only late, on a busy machine, are named.
 
     \b
     Examples:
@@ -154,7 +159,7 @@ def table1(out: Path | None, web: bool, view: bool, as_json: bool) -> int:
     _check_live(web, view)
     from zscout.simulation.demo.table1_screen import play
 
-    return common.run(_played(web, view, lambda live: play(out, as_json=as_json, live=live)))
+    return common.run(_play_live(web, view, lambda live: play(out, as_json=as_json, live=live)))
 
 
 @demo.command()
@@ -163,29 +168,29 @@ def table1(out: Path | None, web: bool, view: bool, as_json: bool) -> int:
     "policies",
     multiple=True,
     type=click.Choice(POLICIES),
-    help="A policy; repeat it for several. Default: all.",
+    help="Use this policy; repeat it for several. Default: all.",
 )
 @click.option(
     "--when",
     "scenarios",
     multiple=True,
     type=click.Choice(SCENARIOS),
-    help="All components at once, or net by net. Default: both.",
+    help="Start all components at once, or net by net. Default: both.",
 )
 @click.option(
     "--out",
     metavar="FOLDER",
     type=click.Path(path_type=Path, file_okay=False),
-    help="Keep a Rerun recording of each trial there.",
+    help="Keep a Rerun recording of each trial here.",
 )
 @common.json_option("Print one JSON object.")
 def placement(policies: tuple[Policy, ...], scenarios: tuple[str, ...], out: Path | None, as_json: bool) -> int:
     """Place three Place Sensor Nets on three live nodes under each policy (Figure 3 of the paper).
 
-    Each trial starts three nodes on this machine, apart from every other fleet; each reports the load of what
-    it started itself. Twelve components, which really use the processor, are started all at once or net by
-    net. A trial takes about 12 seconds. Exit code 1: `pending` did not come within one component of even, or
-    a policy that was given time did not use all hosts.
+    Each trial starts three nodes on this machine, apart from every other fleet; each node reports the load of
+    its own components. Twelve components, which really use the processor, are started all at once or net by
+    net. A trial takes about 12 seconds. Exit code 1: under `pending` two hosts differ by more than one component,
+    or a policy with time to react did not use all hosts.
 
     \b
     Examples:

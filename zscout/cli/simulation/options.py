@@ -1,4 +1,4 @@
-"""What `demo` and `replay` share: a group with a default command, and the option of a recording."""
+"""Shared by `demo` and `replay`: a group with a default command, and the option of a recording."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 
 class DefaultGroup(click.Group):
-    """A group that takes options without a subcommand to be meant for `default`."""
+    """A group that runs the command `default` if no subcommand is named."""
 
     def __init__(self, *args: Any, default: str, **more: Any) -> None:
         super().__init__(*args, **more)
@@ -33,12 +33,12 @@ def rrd_option(*names: str, what: str = " with plots") -> Callable[[F], F]:
         "rrd",
         type=click.Path(path_type=Path),
         metavar="FILE",
-        help=f"Write a Rerun recording{what} besides; look at it with `zscout view FILE`.",
+        help=f"Also write a Rerun recording{what}; open it with `zscout view FILE`.",
     )
 
 
 def check_rrd(rrd: Path | None, *, writable: bool = True) -> None:
-    """Before the work, not after it; with `writable` also that it can be written. Raises BadInput."""
+    """Check the option before the work begins; with `writable` also that the file can be written. Raises BadInput."""
     if rrd is None:
         return
     if rrd.suffix != ".rrd":

@@ -1,4 +1,4 @@
-"""`zscout replay FILE`: what would become of a workload, by the very code that the RCM runs."""
+"""`zscout replay FILE`: schedule a workload by the same code that the RCM runs."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from zscout.scheduling.strategies import STRATEGIES
 @common.json_option("Print one JSON object instead of the table.")
 @rrd_option(what="")
 def replay(file: Path, strategy: StrategyName, as_json: bool, rrd: Path | None) -> None:
-    """Show who would hold which devices, and when, for the requests in FILE.
+    """Compute the holds that the requests in FILE would get.
 
     FILE is a workload (TOML): devices, and requests with their times. table1.toml, of the paper, comes with zscout and
-    is used if there is no other file of that name. No mesh is needed, and no time passes. Without --json it prints a
-    table with a row for each device (for each holder of a sharable device) and a column for each second, or for each
-    interval between two events if seconds are not the right step.
+    is used if there is no other file of that name. No mesh is needed, and no time passes. Without --json the command
+    prints a table with a row for each device (for each holder of a sharable device) and a column for each second, or
+    for each interval between two events if seconds are not the right step.
 
     \b
     Examples:
@@ -39,7 +39,7 @@ def replay(file: Path, strategy: StrategyName, as_json: bool, rrd: Path | None) 
 
 
 def _found(file: Path) -> Path:
-    """The file, or the one of this name that comes with zscout."""
+    """Return the file, or the file of this name that comes with zscout."""
     if file.parent == Path() and not file.exists():
         bundled = Path(str(files("zscout.simulation") / "paper" / file.name))
         if bundled.suffix == ".toml" and bundled.exists():

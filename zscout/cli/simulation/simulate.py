@@ -20,13 +20,13 @@ _ADDRESS: Final = re.compile(r"(?:(?P<host>\[[0-9a-fA-F:.]+\]|[^:\[\]]+):)?(?P<p
 
 
 def buildings(_ctx: click.Context, _param: click.Parameter, incomplete: str) -> list[CompletionItem]:
-    """What serves as a building at Tab: names of those that are shipped, and files."""
+    """Complete a building: names of the shipped buildings, and files."""
     names = [name for name in (*shipped_plans(), f"{RANDOM}:1") if name.startswith(incomplete)]
     return [CompletionItem(name) for name in names] or [CompletionItem(incomplete, type="file")]
 
 
 def parse_address(text: str, option: str) -> tuple[str, int]:
-    """Host and port of `HOST:PORT` or `PORT`. Raises BadInput."""
+    """Parse `HOST:PORT` or `PORT`. Raises BadInput."""
     found = _ADDRESS.fullmatch(text)
     if found is None or int(found["port"]) > 65_535:
         raise BadInput(f"{option}: {quoted(text)} is not an address; write HOST:PORT, as in 127.0.0.1:8080")
@@ -60,14 +60,14 @@ def parse_address(text: str, option: str) -> tuple[str, int]:
     metavar="HOST:PORT",
     type=common.Parsed("text", parse_address),
     default="127.0.0.1:0",
-    help="Address at which cameras are served; port 0 is any free port.",
+    help="Serve the cameras at this address; port 0 is any free port.",
 )
-@click.option("--channels", type=click.IntRange(1, 15), default=4, help="Video channels served.")
+@click.option("--channels", type=click.IntRange(1, 15), default=4, help="Number of video channels.")
 @click.option(
     "--baud",
     type=click.IntRange(300, 1_000_000),
     default=9600,
-    help="Rate of the radio's line; --speed makes the line faster, too.",
+    help="Rate of the radio's line; --speed makes the line faster as well.",
 )
 @click.option("--loss", type=click.FloatRange(0, 1), default=0.0, help="Share of the radio's packets that are lost.")
 @click.option(
@@ -75,7 +75,7 @@ def parse_address(text: str, option: str) -> tuple[str, int]:
     "radio_link",
     metavar="LINK",
     type=click.Path(path_type=Path),
-    help="A name for the radio's port: a symlink, removed at the end.",
+    help="Create this symlink to the radio's port; it is removed at the end.",
 )
 @click.option(
     "--node",
@@ -83,16 +83,21 @@ def parse_address(text: str, option: str) -> tuple[str, int]:
     type=click.Path(path_type=Path, dir_okay=False),
     help="Write a node file with all the devices: zscout node FILE serves them.",
 )
-@click.option("--framegrabbers", type=click.IntRange(1, MAX_FRAMEGRABBERS), default=2, help="Number in the node file.")
+@click.option(
+    "--framegrabbers",
+    type=click.IntRange(1, MAX_FRAMEGRABBERS),
+    default=2,
+    help="Number of framegrabbers in the node file.",
+)
 @click.option("--mesh", is_flag=True, help="Publish positions on the mesh, for recorders and operators.")
 @click.option("--for", "seconds", type=SECONDS, help="End after this time in the building: 90s. Default: at Ctrl-C.")
 @common.json_option("Print how to reach everything as one JSON object.")
 def simulate(building: str | None, listing: bool, mesh: bool, as_json: bool, **options: Any) -> None:
     """Serve a simulated building: a radio on a serial port, cameras as MJPEG over HTTP, in real time.
 
-    BUILDING is the name of a shipped building (--list), a TOML file, or random:SEED for a random one. Robots move
-    and see as packets over the radio order them to; docs/simulation.md describes what is realistic, and how to
-    write a building.
+    BUILDING is the name of a shipped building (--list), a TOML file, or random:SEED for a random one. Packets over
+    the radio control the robots; docs/simulation.md describes how realistic the simulation is, and how to write a
+    building.
 
     \b
     Examples:
