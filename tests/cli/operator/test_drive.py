@@ -18,7 +18,7 @@ from tests.hang import HANG
 from zscout.behaviors.client.client import Client
 from zscout.behaviors.sensor_net.held_robot import RobotNeeds
 from zscout.behaviors.teleop import Pilot, Teleop
-from zscout.cli.operator.drive import AXIS, BUTTON, FULL, INITIAL, PAD_EVENT, Hands, _Console, game_pad
+from zscout.cli.operator.drive import AXIS, BUTTON, FULL_DEFLECTION, INITIAL, PAD_EVENT, Hands, _Console, game_pad
 from zscout.config.strict import BadInput
 from zscout.mesh import clock
 from zscout.terminal import KEYS, MAX_TYPED, typed_keys
@@ -123,7 +123,9 @@ def test_a_pad_moves_stops_and_is_unplugged(tmp_path: Path) -> None:
 
             # As Linux does, it first tells how all stands.
             os.write(pad, happens((0, AXIS | INITIAL, 0), (0, AXIS | INITIAL, 1), (0, BUTTON | INITIAL, 0)))
-            os.write(pad, happens((-FULL, AXIS, 1), (FULL // 2, AXIS, 0), (FULL, AXIS, 5)))
+            os.write(
+                pad, happens((-FULL_DEFLECTION, AXIS, 1), (FULL_DEFLECTION // 2, AXIS, 0), (FULL_DEFLECTION, AXIS, 5))
+            )
             await comes_true(lambda: len(moves) == 4)
             assert moves[-1] == pytest.approx((1.0, 0.5), abs=0.001)
             os.write(pad, happens((1, BUTTON, 1), (0, BUTTON, 1), (1, BUTTON, 0)))

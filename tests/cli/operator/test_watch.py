@@ -70,7 +70,7 @@ def test_a_file_is_told_event_by_event(video: Path, capsys: pytest.CaptureFixtur
 def test_in_a_pipe_it_is_plain_lines_and_the_limit_ends_it(video: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert zscout_here("watch", "--source", video, "--limit", 6) == 0
     event, summary = capsys.readouterr().out.splitlines()
-    assert "motion and goes on, one thing at the peak, the largest " in event
+    assert "motion and continues, one area at the peak, the largest " in event
     assert summary.startswith("6.0 s watched, 61 pictures; 1 event, motion for ")
 
 
@@ -235,7 +235,7 @@ HANGING = """if True:
         for _ in range(2):
             ctypes.CDLL(None).pthread_mutex_lock(mutex)
 
-    watch.PATIENCE = 0.1
+    watch.END_TIMEOUT_S = 0.1
     picture_recording.WatchRecording.seen = hang
     main(sys.argv[1:])"""
 """A recording in which Rerun never returns; no signal handler of Python's runs then."""
@@ -281,7 +281,7 @@ def test_a_camera_that_breaks_off_is_opened_again_and_ctrl_c_ends_with_a_summary
     hangs.start()
     try:
         told = ""
-        while "gives pictures again" not in told:
+        while "delivers pictures again" not in told:
             line = process.stderr.readline()
             assert line, told
             told += line
@@ -297,7 +297,7 @@ def test_a_camera_that_breaks_off_is_opened_again_and_ctrl_c_ends_with_a_summary
     assert process.returncode == 130
     assert all(event["start"] <= event["end"] and event["boxes"] for event in events)
     assert f"{camera.url} was cut off; opening it again" in told
-    assert f"{camera.url} gives pictures again" in told
+    assert f"{camera.url} delivers pictures again" in told
     assert " watched, " in told.splitlines()[-1]
     assert camera.accepted >= 2
 

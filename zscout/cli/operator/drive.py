@@ -1,4 +1,4 @@
-"""`zscout drive`: a robot in the operator's hands."""
+"""`zscout drive`: an operator drives a robot by keyboard or game pad."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ if TYPE_CHECKING:
     from zscout.behaviors.teleop import Teleop, Way
     from zscout.cli.operator.picture_recording import PictureRecording
 
-REFRESH: Final = 0.2
-"""Seconds between two drawings of the live line."""
+REFRESH_INTERVAL_S: Final = 0.2
+"""Interval between two drawings of the live line."""
 MAX_RATE: Final = 50.0
 
 WAYS: Final[dict[Way, tuple[bytes, ...]]] = {
@@ -35,7 +35,7 @@ WAYS: Final[dict[Way, tuple[bytes, ...]]] = {
     "right": (b"d", b"\x1b[C", b"\x1bOC"),
     "left": (b"a", b"\x1b[D", b"\x1bOD"),
 }
-"""Keys that drive: w a s d, and arrows in both forms that terminals send."""
+"""Driving keys: w a s d, and arrows in both forms that terminals send."""
 KEYS: Final = {key: way for way, keys in WAYS.items() for key in keys}
 
 PAD_EVENT: Final = struct.Struct("<IhBB")
@@ -45,13 +45,13 @@ BUTTON: Final = 0x01
 INITIAL: Final = 0x80
 ACROSS, ALONG = 0, 1
 """Axes of the left stick."""
-FULL: Final = 32_767
+FULL_DEFLECTION: Final = 32_767
 
-HELP: Final = "arrows or wasd drive · space stops · + - speed · g gives back · q ends"
+HELP: Final = "arrows or wasd drive · space stops · + - speed · g releases · q ends"
 
 
 def _rc_option(kind: str) -> Callable[[common.F], common.F]:
-    """`--radio RC` and the like; any one of this kind unless it is named."""
+    """`--radio RC` and the like. Default: any RC of this kind."""
     rc = common.Parsed("rc", lambda text, _: parse_rc(text, kind, pattern=True))
     return click.option(f"--{kind}", default=f"{kind}/*", type=rc, shell_complete=completion.rcs)
 
@@ -64,18 +64,15 @@ def _rc_option(kind: str) -> Callable[[common.F], common.F]:
 @_rc_option("video")
 @_rc_option("framegrabber")
 @click.option(
-    "--rate",
-    type=click.FloatRange(0.5, MAX_RATE),
-    default=5.0,
-    help="Commands per second: the share of the radio to request.",
+    "--rate", type=click.FloatRange(0.5, MAX_RATE), default=5.0, help="Commands per second, requested from the radio."
 )
 @click.option("--speed", type=click.FloatRange(0.1, 1.0), default=0.6, help="Share of the robot's top speed.")
 @click.option("--stand-by", is_flag=True, help="Take the robot at the first driving key, not at once.")
-@click.option("--pad", type=click.Path(path_type=Path), metavar="DEVICE", help="Drive by a game pad's stick as well.")
+@click.option("--pad", type=click.Path(path_type=Path), metavar="DEVICE", help="Also drive by a game pad's stick.")
 @click.option("--no-picture", is_flag=True, help="Drive without looking.")
 @click.option("--no-view", is_flag=True, help="Open no viewer; print the picture's address.")
 @click.option("--record", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE.rrd", help="Record pictures.")
-@common.json_option("Print JSON lines: taken, waiting, free, and what came of it.")
+@common.json_option("Print one JSON object on a line for each event.")
 @common.runs
 async def drive(
     robot: str,
@@ -93,12 +90,12 @@ async def drive(
 ) -> None:
     """Take ROBOT with a radio, a video channel and a framegrabber, and drive it.
 
-    It takes them at the fleet's operator priority without asking: a preempted holder continues when you give them
-    back, with g or q, or when this terminal closes. The robot stops whenever you release the keys. The Rerun viewer
-    shows the picture; for a host without a display its address is printed.
+    The command takes them at the fleet's operator priority without asking. Preempted holders continue when you release
+    the robot, with g or q, or when this terminal closes. The robot stops whenever you let go of the keys. The Rerun
+    viewer shows the picture; on a host without a display the command prints its address.
 
-    Keys: arrows or w a s d drive, space stops, + and - change the speed, g gives the robot back and the next driving
-    key takes it again, q ends. On a pad the left stick drives, button 0 stops, button 1 gives back.
+    Keys: arrows or w a s d drive, space stops, + and - change the speed, g releases the robot and the next driving
+    key takes it again, q ends. On a pad the left stick drives, button 0 stops, button 1 releases the robot.
 
     \b
     Examples:
@@ -137,17 +134,17 @@ async def drive(
 
         works = [end.wait(), teleop.run(), console.keep_drawing(teleop)]
         await common.first_of(*works, *([] if no_picture else [look()]))
-    console.event("ended", "given back")
+    console.event("ended", "released")
 
 
 async def _stream(
     stack: AsyncExitStack, robot: str, record: Path | None, console: _Console, *, view: bool
 ) -> PictureRecording:
-    """The picture's stream, and a window onto it where there is a display."""
+    """Start the picture's stream, with a window if there is a display."""
     from zscout.cli.fleet.view import WINDOW_ARGUMENTS, has_display, viewer
     from zscout.ports import free_port
 
-    # Rerun takes seconds to load on a busy machine, and the operator may be in a hurry.
+    # On a busy machine Rerun takes seconds to load: load it in a thread, so that the operator can drive already.
     await asyncio.to_thread(importlib.import_module, "zscout.cli.operator.picture_recording")
     from zscout.cli.operator.picture_recording import PictureRecording
 
@@ -161,31 +158,31 @@ async def _stream(
 
 
 async def show_pictures(teleop: Teleop, stream: PictureRecording, console: _Console) -> None:
-    """Passes the newest picture of the held framegrabber on, without end."""
+    """Record each newest picture of the held framegrabber, without end."""
     mesh = teleop.client.mesh
     zero = mesh.now()
     while True:
         robot, held = teleop.robot, teleop.held
         if robot is None or held is None:
-            await asyncio.sleep(REFRESH)
+            await asyncio.sleep(REFRESH_INTERVAL_S)
             continue
         stream.words((mesh.now() - zero) / SECOND, f"{robot.robot} is yours, seen through {robot.framegrabber}")
         with closing(mesh.frames(mesh.keys.frame(robot.framegrabber))) as frames:
             while teleop.robot is robot:
-                frame = await frames.next(REFRESH)
+                frame = await frames.next(REFRESH_INTERVAL_S)
                 if frame is not None and frame.head.grant == held.grant:
                     stream.picture((frame.arrived - zero) / SECOND, frame.jpeg)
                     console.seen(frame.arrived)
 
 
 class _Console(terminal.LiveLine):
-    """What the operator sees: a live line, or JSON lines. A context manager."""
+    """The operator's output: a live line, or JSON lines."""
 
     def __init__(self, robot: str, *, as_json: bool) -> None:
         super().__init__(shown=not as_json)
         self._robot, self._as_json = robot, as_json
         self._pictures: list[int] = []
-        self._told: object = None
+        self._printed: object = None
 
     def event(self, event: str, words: str, **more: Any) -> None:
         if self._as_json:
@@ -195,9 +192,9 @@ class _Console(terminal.LiveLine):
 
     def update(self, teleop: Teleop) -> None:
         now = (teleop.state, teleop.why, teleop.takeover)
-        if now == self._told:
+        if now == self._printed:
             return
-        before, self._told = self._told, now
+        before, self._printed = self._printed, now
         if teleop.state == "driving" and teleop.takeover is not None:
             words = f"{self._robot} obeys, {1000 * teleop.takeover:.0f} ms after you took it"
             self.event("driving", words, takeover=teleop.takeover)
@@ -207,16 +204,16 @@ class _Console(terminal.LiveLine):
         elif teleop.state == "waiting":
             self.event("waiting", f"{self._robot} {waits(teleop.why, teleop.reason)}", why=teleop.why)
         elif before is not None:
-            self.event("free", f"{self._robot} is given back")
+            self.event("free", f"{self._robot} is released")
 
     def seen(self, at: int) -> None:
-        self._pictures = [one for one in self._pictures if at - one < SECOND] + [at]
+        self._pictures = [arrived for arrived in self._pictures if at - arrived < SECOND] + [at]
 
     async def keep_drawing(self, teleop: Teleop) -> None:
         while True:
             if self.watched:
                 self._picture(teleop)
-            await asyncio.sleep(REFRESH)
+            await asyncio.sleep(REFRESH_INTERVAL_S)
 
     def _picture(self, teleop: Teleop) -> None:
         from rich.text import Text
@@ -238,7 +235,7 @@ class _Console(terminal.LiveLine):
 
 
 class Hands:
-    """What the operator's keys and game pad do."""
+    """Actions of the operator's keys and game pad."""
 
     def __init__(self, teleop: Teleop, end: asyncio.Event) -> None:
         self.teleop, self.pilot, self._end = teleop, teleop.pilot, end
@@ -278,8 +275,8 @@ class Hands:
 
 @contextmanager
 def game_pad(device: Path, moved: Callable[[float, float], None], button: Callable[[int], None]) -> Iterator[None]:
-    """Calls `moved(forward, right)`, -1 to 1 each, as the left stick moves, and `button` with the number of
-    one that is pressed. A pad that is unplugged moves to 0, 0. Raises BadInput for what can't be opened."""
+    """Call `moved(forward, right)`, -1 to 1 each, when the left stick moves, and `button` with the number of a pressed
+    button. An unplugged pad moves to 0, 0. Raises BadInput if the device can't be opened."""
     try:
         descriptor = os.open(device, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     except OSError as error:
@@ -302,8 +299,8 @@ def game_pad(device: Path, moved: Callable[[float, float], None], button: Callab
         whole = len(events) // PAD_EVENT.size * PAD_EVENT.size
         for _, value, kind, number in PAD_EVENT.iter_unpack(events[:whole]):
             if kind & ~INITIAL == AXIS and number in stick:
-                stick[number] = value / FULL
-                # Pushed away from oneself is negative there.
+                stick[number] = value / FULL_DEFLECTION
+                # The interface reports forward as negative.
                 moved(-stick[ALONG], stick[ACROSS])
             elif kind == BUTTON and value:
                 button(number)

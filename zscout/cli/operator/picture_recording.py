@@ -1,4 +1,4 @@
-"""What `zscout drive` and `zscout motion` see of a camera, as a Rerun recording of its own."""
+"""Rerun recordings of a camera by `zscout drive` and `zscout motion`."""
 
 from __future__ import annotations
 
@@ -20,22 +20,22 @@ from zscout.services.recorder.colours import OPERATOR, OTHER
 from zscout.services.recorder.drawing import Drawing, clean_text, disconnect, unwritten
 from zscout.services.recorder.timeline import TimelineError
 
-MEMORY: Final = "100MB"
-"""What is kept for a viewer that opens late."""
+SERVER_MEMORY: Final = "100MB"
+"""Data kept for a viewer that opens late."""
 DISCONNECT_SECONDS: Final = 3.0
 FLUSH_SECONDS: Final = 3.0
-CHECK_EVERY: Final = 1 << 22
-"""Bytes of pictures between two looks whether the file can be written."""
-WIDTH: Final = 640
-"""Columns of a picture of a watch; larger ones are reduced."""
-QUALITY: Final = 75
-MAX_BYTES: Final = 2 << 30
-"""Of pictures of one watch; then only boxes and events are written."""
+CHECK_INTERVAL_BYTES: Final = 1 << 22
+"""Bytes of pictures between two checks that the file can be written."""
+MAX_WIDTH: Final = 640
+"""Columns of a recorded picture; wider pictures are scaled down."""
+JPEG_QUALITY: Final = 75
+MAX_PICTURE_BYTES: Final = 2 << 30
+"""Size of all pictures of a recording; after that only boxes and events are written."""
 
 
 class PictureRecording(Drawing):
-    """Pictures above events, in a file or served on loopback, or both. A context manager. `at` is seconds since
-    whatever zero the caller chose."""
+    """A recording of pictures and events, in a file, or served on loopback, or both. Times are seconds since a zero of
+    the caller's choice."""
 
     def __init__(
         self,
@@ -47,12 +47,12 @@ class PictureRecording(Drawing):
         between: Sequence[rrb.View] = (),
         shares: Sequence[int] = (5, 1),
     ) -> None:
-        """`port` must be free. Raises TimelineError where `file` can't be written."""
+        """`port` must be free. Raises TimelineError if `file` can't be written."""
         self._recording = rr.RecordingStream(APPLICATION, recording_id=f"{command}-{new_instance()}")
         super().__init__(self._recording)
         self._file = file
         self.url = f"rerun+http://127.0.0.1:{port}/proxy" if port is not None else ""
-        """Where a viewer finds it, if it is served."""
+        """Address for a viewer; empty if it is not served."""
         layout = page(
             rrb.Vertical(
                 rrb.Spatial2DView(origin="/picture", name=clean_text(title)),
@@ -64,7 +64,7 @@ class PictureRecording(Drawing):
         )
         sinks: list[rr.GrpcServerSink | rr.FileSink] = []
         if port is not None:
-            sinks.append(rr.GrpcServerSink(bind_ip="127.0.0.1", port=port, server_memory_limit=MEMORY))
+            sinks.append(rr.GrpcServerSink(bind_ip="127.0.0.1", port=port, server_memory_limit=SERVER_MEMORY))
         try:
             if file is not None:
                 file.parent.mkdir(parents=True, exist_ok=True)
@@ -80,7 +80,7 @@ class PictureRecording(Drawing):
         self.log(at, "picture", rr.EncodedImage(contents=jpeg, media_type="image/jpeg"))
 
     def check(self) -> None:
-        """Blocks until the file has all that was logged. Raises Failed where it can't be written."""
+        """Block until the file has everything logged so far. Raises Failed if it can't be written."""
         if self._file is not None and (why := unwritten(self._recording, self._file, FLUSH_SECONDS)):
             raise Failed(why)
 
@@ -96,7 +96,7 @@ class PictureRecording(Drawing):
 
 
 class WatchRecording(PictureRecording):
-    """Pictures with boxes where something moves, in a file."""
+    """A recording of pictures with boxes around motion, in a file."""
 
     def __init__(self, title: str, file: Path) -> None:
         share = rrb.TimeSeriesView(origin="/moving", name="Share of the picture that moves, %")
@@ -104,15 +104,15 @@ class WatchRecording(PictureRecording):
         self._bytes = 0
 
     def seen(self, at: float, picture: NDArray[np.uint8], boxes: Sequence[Box], *, moving: bool) -> None:
-        """A picture with boxes in its pixels: `moving`, or else not sure yet."""
+        """Record a picture with boxes in its pixels. `moving`: motion is certain."""
         height, width = picture.shape[:2]
-        scale = min(1.0, WIDTH / width)
-        if self._bytes < MAX_BYTES:
+        scale = min(1.0, MAX_WIDTH / width)
+        if self._bytes < MAX_PICTURE_BYTES:
             if scale < 1:
-                size = (WIDTH, max(1, round(height * scale)))
+                size = (MAX_WIDTH, max(1, round(height * scale)))
                 picture = np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), np.uint8)
-            jpeg = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])[1].tobytes()
-            if self._bytes // CHECK_EVERY != (self._bytes + len(jpeg)) // CHECK_EVERY:
+            jpeg = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1].tobytes()
+            if self._bytes // CHECK_INTERVAL_BYTES != (self._bytes + len(jpeg)) // CHECK_INTERVAL_BYTES:
                 self.check()
             self._bytes += len(jpeg)
             self.picture(at, jpeg)

@@ -1,4 +1,4 @@
-"""`zscout motion`: the motion detector alone, on any source that OpenCV opens, to place a camera."""
+"""`zscout motion`: run the motion detector alone, on any source that OpenCV opens, to place a camera."""
 
 from __future__ import annotations
 
@@ -31,13 +31,13 @@ if TYPE_CHECKING:
     from zscout.cli.operator.picture_recording import WatchRecording
     from zscout.cli.operator.watch_source import LiveSource, VideoFile
 
-PATIENCE: Final = 8.0
-"""Seconds from a signal to the end, for what was recorded to be written."""
-DRAWN: Final = 0.1
-"""Seconds from one live line to the next."""
+END_TIMEOUT_S: Final = 8.0
+"""Longest time from a signal to the end: the recording is written."""
+REDRAW_INTERVAL_S: Final = 0.1
+"""Interval between two drawings of the live line."""
 
 
-def _region(text: str, option: str) -> list[float]:
+def _parse_region(text: str, option: str) -> list[float]:
     try:
         return parse_region(text)
     except ValueError as error:
@@ -45,7 +45,7 @@ def _region(text: str, option: str) -> list[float]:
 
 
 def sources(_ctx: click.Context, _param: click.Parameter, incomplete: str) -> list[CompletionItem]:
-    """What serves as a source at Tab: files, and the cameras that are there."""
+    """Complete a source: files, and the cameras of this host."""
     cameras = sorted(str(path) for path in Path("/dev").glob("video*"))
     offered = [CompletionItem(camera) for camera in cameras if incomplete and camera.startswith(incomplete)]
     return offered or [CompletionItem(incomplete, type="file")]
@@ -58,20 +58,20 @@ def sources(_ctx: click.Context, _param: click.Parameter, incomplete: str) -> li
     type=common.Parsed("source", lambda text, _: text),
     shell_complete=sources,
     required=True,
-    help="A video file, an http:// or rtsp:// address, /dev/videoN or its number.",
+    help="Read pictures from a video file, an http:// or rtsp:// address, /dev/videoN or its number.",
 )
-@common.json_option("Print one JSON object on a line for each event; the summary goes to stderr.")
+@common.json_option("Print one JSON object on a line for each event, and the summary on stderr.")
 @click.option(
     "--record",
     metavar="FILE",
     type=click.Path(path_type=Path, dir_okay=False),
-    help="Write pictures, boxes and events as a Rerun recording; look at it with `zscout view FILE`.",
+    help="Write pictures, boxes and events as a Rerun recording; open it with `zscout view FILE`.",
 )
 @click.option("--limit", type=SECONDS, help="End after this much of the source. Default: at its end, or at Ctrl-C.")
 @click.option(
     "--ignore",
     metavar="X,Y,X,Y...",
-    type=common.Parsed("region", _region),
+    type=common.Parsed("region", _parse_region),
     multiple=True,
     help="Ignore motion in this region. Its corners are shares of the picture's width and height, from 0 to 1: two "
     "opposite corners of a rectangle, or three or more of a polygon. Can be repeated.",
@@ -80,7 +80,7 @@ def sources(_ctx: click.Context, _param: click.Parameter, incomplete: str) -> li
     "--min-area",
     type=click.FloatRange(0, MAX_MIN_AREA),
     default=0.0,
-    help="Ignore things below this share of the picture.",
+    help="Ignore moving areas below this share of the picture.",
 )
 @click.option("--min-duration", type=seconds_within(0, MAX_MIN_DURATION), default="0", help="Leave out shorter events.")
 def motion(
@@ -94,11 +94,12 @@ def motion(
 ) -> None:
     """Report motion: one line for each event, when the event ends.
 
-    A file is read whole, as fast as possible, by its own time stamps; of a URL or camera the newest picture counts, and
-    it is opened again when it fails. An event ends when nothing moved for a second. Its `start`, `end` and `peak` are
-    seconds of the source; `boxes`, [x, y, width, height] in its pixels, surround motion at the peak; `area` surrounds
-    all motion; `frames` counts the pictures with motion. The detector adapts to the scene and needs no tuning;
-    docs/watching.md describes what it can do. The keys of a framegrabber in the node file are named as the options are.
+    A file is read whole, as fast as possible, by its own time stamps. From a URL or camera the newest picture is used,
+    and a source that fails is opened again. An event ends when nothing moved for a second. Its `start`, `end` and
+    `peak` are seconds of the source; `boxes`, [x, y, width, height] in its pixels, surround motion at the peak; `area`
+    surrounds all motion; `frames` counts the pictures with motion. The detector adapts to the scene and needs no
+    tuning; docs/watching.md describes its abilities. A framegrabber in the node file has keys with the names of these
+    options.
 
     \b
     Examples:
@@ -113,7 +114,7 @@ def motion(
     begun = False
 
     def on_signal(number: int, _: FrameType | None) -> None:
-        # It ends at the next picture; before the first one, and the second time, at once.
+        # The first signal ends the command at the next picture; at once before any picture, or at a second signal.
         if ended_by or not begun:
             raise common.Interrupted(number)
         ended_by.append(number)
@@ -121,16 +122,16 @@ def motion(
     with ExitStack() as stack:
         stack.enter_context(_ended_by_signals())
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-            # What a shell or nohup made this process ignore stays ignored.
+            # Signals that a shell or nohup made this process ignore stay ignored.
             if signal.getsignal(number) is not signal.SIG_IGN:
                 stack.callback(signal.signal, number, signal.signal(number, on_signal))
         report = stack.enter_context(_WatchReport(as_json=as_json))
         from zscout.cli.operator.watch_source import open_source
 
-        opened = open_source(source, report.say)
+        opened = open_source(source, report.warn)
         stack.callback(opened.close)
         if record is not None:
-            os.environ.setdefault("RUST_LOG", "off")  # Rerun's words: what fails is reported here
+            os.environ.setdefault("RUST_LOG", "off")  # silence Rerun: this command reports failures
             from zscout.cli.operator.picture_recording import WatchRecording
             from zscout.services.recorder.timeline import TimelineError
 
@@ -147,14 +148,14 @@ def motion(
 
 @contextmanager
 def _ended_by_signals() -> Iterator[None]:
-    """A signal ends this process in the end, though its main thread hangs in a library and can't handle it."""
+    """Let a signal end this process after END_TIMEOUT_S even if its main thread hangs in a library."""
     reading, writing = os.pipe()
     os.set_blocking(writing, False)
     over, before = threading.Event(), signal.set_wakeup_fd(writing, warn_on_full_buffer=False)
 
     def insist() -> None:
         while numbers := os.read(reading, 1):
-            if numbers[0] in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP) and not over.wait(PATIENCE):
+            if numbers[0] in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP) and not over.wait(END_TIMEOUT_S):
                 os._exit(128 + numbers[0])
 
     thread = threading.Thread(target=insist, daemon=True)
@@ -196,7 +197,7 @@ def _watch(
 
 
 class _WatchReport(LiveLine):
-    """What people and programs read of it: a live line where people look, at stdout or else at stderr."""
+    """The output: events, and a live line at a terminal, on stdout or else on stderr."""
 
     def __init__(self, *, as_json: bool) -> None:
         super().__init__(sys.stdout if terminal.at_terminal() else sys.stderr)
@@ -223,7 +224,7 @@ class _WatchReport(LiveLine):
         else:
             terminal.print_line(text)
 
-    def say(self, text: str) -> None:
+    def warn(self, text: str) -> None:
         text = terminal.clean(text)
         if self.recording is not None:
             self.recording.words(self.at, text)
@@ -234,7 +235,7 @@ class _WatchReport(LiveLine):
 
     def show(self, duration: float | None, event: Event | None) -> None:
         now = clock.now()
-        if not self.watched or now - self._drawn < DRAWN * SECOND:
+        if not self.watched or now - self._drawn < REDRAW_INTERVAL_S * SECOND:
             return
         self._drawn = now
         from rich.text import Text
@@ -256,8 +257,8 @@ class _WatchReport(LiveLine):
 
 def _words(event: Event) -> str:
     largest = event.boxes[0]
-    things = "one thing" if len(event.boxes) == 1 else f"{len(event.boxes)} things"
-    end = "and goes on" if event.going_on else f"for {span(event.end - event.start)}"
+    things = "one area" if len(event.boxes) == 1 else f"{len(event.boxes)} areas"
+    end = "and continues" if event.going_on else f"for {span(event.end - event.start)}"
     return (
         f"{event.start:9.2f} to {event.end:.2f} s: motion {end}, {things} at the peak, the largest "
         f"{largest.width}x{largest.height} at {largest.x},{largest.y}"

@@ -1,4 +1,4 @@
-"""Where `zscout motion` has its pictures from: files, by their own time stamps, and live sources."""
+"""Sources of pictures for `zscout motion`: files, by their own time stamps, and live sources."""
 
 from __future__ import annotations
 
@@ -16,28 +16,28 @@ from zscout.behaviors.perception.motion import MAX_SIDE
 from zscout.config.strict import BadInput, quoted
 from zscout.drivers.capture import FILE_RATE, FILE_RATES, MAX_PIXELS, MISSES, Capture, is_utf8, kind_of, seconds, shown
 
-OPEN_TIMEOUT: Final = 5.0
-READ_TIMEOUT: Final = 2.0
-"""Seconds of a URL."""
-LOOK: Final = 0.2
-"""Seconds for which a live source is waited for at a time."""
-LEAST_SIDE: Final = 8
-MAX_LEAP: Final = 86_400.0
-"""Seconds from one picture of a file to the next."""
-HEAD: Final = 4096
-TEXT: Final = bytes((*range(7, 14), 27, *range(32, 256)))
-"""Bytes of which a text consists; in the HEAD of a video there are others."""
+OPEN_TIMEOUT_S: Final = 5.0
+READ_TIMEOUT_S: Final = 2.0
+"""For URLs."""
+WAIT_S: Final = 0.2
+"""Longest wait for one picture of a live source."""
+MIN_SIDE: Final = 8
+MAX_LEAP_S: Final = 86_400.0
+"""Largest believable step between the time stamps of two pictures of a file."""
+HEAD_BYTES: Final = 4096
+TEXT_BYTES: Final = bytes((*range(7, 14), 27, *range(32, 256)))
+"""The bytes of a text; the head of a video has others."""
 
 
 class Shot(NamedTuple):
-    """A picture at `time`, seconds of the source; without one, none came until then."""
+    """A picture at `time`, in seconds of the source; None: no picture came until then."""
 
     time: float
     picture: NDArray[np.uint8] | None
 
 
 def open_source(source: str, report: Callable[[str], None]) -> VideoFile | LiveSource:
-    """Opens a file, URL or device. `report` is given what becomes of a live one. Raises BadInput."""
+    """Open a file, URL or device. `report` receives failures and recoveries of a live source. Raises BadInput."""
     if not source or "\0" in source:
         raise BadInput("--source is empty; name a file, a URL or a device like /dev/video0")
     if kind_of(source) == "file":
@@ -46,7 +46,7 @@ def open_source(source: str, report: Callable[[str], None]) -> VideoFile | LiveS
 
 
 class VideoFile:
-    """A video file. Times are the file's own, from its first picture on."""
+    """A video file. Times are the file's time stamps, from its first picture on."""
 
     def __init__(self, path: Path) -> None:
         """Raises BadInput."""
@@ -55,19 +55,19 @@ class VideoFile:
             if not stat.S_ISREG(path.stat().st_mode):
                 raise BadInput(f"{quoted(self.name)} is not a file; name a video file, a URL or a device")
             with path.open("rb") as file:
-                head = file.read(HEAD)
+                head = file.read(HEAD_BYTES)
         except (OSError, ValueError) as error:
             why = (error.strerror if isinstance(error, OSError) else None) or error
             raise BadInput(f"{quoted(self.name)} can't be read ({why}); name a video file, a URL or a device") from None
-        nothing = BadInput(f"there is no video in {quoted(self.name)}; name a file that FFmpeg can read")
+        no_video = BadInput(f"there is no video in {quoted(self.name)}; name a file that FFmpeg can read")
         if not is_utf8(str(path.absolute())):
             raise BadInput(
                 f"the name of {quoted(self.name)} or its folder is not UTF-8, which OpenCV can't open; rename it"
             )
-        # FFmpeg draws a text as a picture, and follows playlists to wherever they point.
-        if not head or not head.translate(None, TEXT):
-            raise nothing
-        # FFmpeg would write of every torn picture to stderr itself (-8: quiet).
+        # Refuse texts: FFmpeg would draw a text as a picture, and open any address in a playlist.
+        if not head or not head.translate(None, TEXT_BYTES):
+            raise no_video
+        # FFmpeg would log every damaged picture to stderr (-8: quiet).
         os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
         if "OPENCV_LOG_LEVEL" not in os.environ:
             cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)
@@ -76,13 +76,13 @@ class VideoFile:
         self._first = self._read() if self._video.isOpened() else None
         if self._first is None:
             self._video.release()
-            raise nothing
+            raise no_video
         _check(self._first, self.name)
         rate = self._video.get(cv2.CAP_PROP_FPS)
         self._period = 1 / (rate if FILE_RATES[0] <= rate <= FILE_RATES[1] else FILE_RATE)
         count = self._video.get(cv2.CAP_PROP_FRAME_COUNT)
         self.duration = count * self._period if 1 <= count < 1e9 else None
-        """Seconds; None where nobody knows."""
+        """Seconds; None: unknown."""
 
     def shots(self) -> Iterator[Shot]:
         picture, zero, last = self._first, self._stamp(), 0.0
@@ -92,8 +92,8 @@ class VideoFile:
             yield Shot(last, picture)
             picture = self._read()
             at = self._stamp() - zero
-            # A stamp that is missing, goes back or leaps beyond belief is replaced by the usual step.
-            last = at if last < at <= last + MAX_LEAP else last + self._period
+            # Replace a time stamp that is missing, goes back or leaps too far by the usual step.
+            last = at if last < at <= last + MAX_LEAP_S else last + self._period
 
     def close(self) -> None:
         self._video.release()
@@ -102,7 +102,7 @@ class VideoFile:
         return float(self._video.get(cv2.CAP_PROP_POS_MSEC)) / 1000
 
     def _read(self) -> NDArray[np.uint8] | None:
-        """The next picture; None at the end. One that can't be made out is passed over."""
+        """Return the next picture; None at the end. Damaged pictures are skipped, at most MISSES in a row."""
         for _ in range(MISSES):
             good, picture = self._video.read()
             if good and picture.dtype == np.uint8:
@@ -111,20 +111,20 @@ class VideoFile:
 
 
 class LiveSource:
-    """A URL or device, as framegrabbers read it: the newest picture wins, and a source that fails is
-    opened again. Times are seconds since the first picture."""
+    """A URL or device, as framegrabbers read it: the newest picture is used, and a source that fails is opened again.
+    Times are seconds since the first picture."""
 
     duration: float | None = None
 
     def __init__(self, source: str, report: Callable[[str], None]) -> None:
-        """Waits for the first picture. Raises BadInput where there is none to be had."""
+        """Wait for the first picture. Raises BadInput if the source fails before."""
         self.name = shown(source)
         self._report = report
-        self._capture = Capture(source, open_timeout=OPEN_TIMEOUT, read_timeout=READ_TIMEOUT)
+        self._capture = Capture(source, open_timeout=OPEN_TIMEOUT_S, read_timeout=READ_TIMEOUT_S)
         try:
             first = None
             while first is None:
-                first = self._capture.wait(0, LOOK)
+                first = self._capture.wait(0, WAIT_S)
                 if first is None and self._capture.failed:
                     raise BadInput(f"{self._capture.health}; name a source that delivers pictures")
             _check(first.picture, self.name)
@@ -134,18 +134,18 @@ class LiveSource:
         self._zero = first.time
 
     def shots(self) -> Iterator[Shot]:
-        """All pictures, without end; an empty shot now and then while there are none."""
+        """Yield all pictures, without end; an empty shot every WAIT_S without a picture."""
         number, missing, frozen = 0, None, False
         while True:
-            taken = self._capture.wait(number, LOOK)
+            taken = self._capture.wait(number, WAIT_S)
             if taken is not None:
                 if bool(taken.frozen) != frozen:
                     frozen = not frozen
-                    words = f"is frozen: the same picture for {taken.frozen:.0f} s" if frozen else "gives new pictures"
+                    words = f"is frozen: the same picture for {taken.frozen:.0f} s" if frozen else "has new pictures"
                     self._report(f"{self.name} {words}")
                 number, at = taken.number, taken.time - self._zero
                 if missing is not None:
-                    self._report(f"{self.name} gives pictures again, after {at - missing:.1f} s")
+                    self._report(f"{self.name} delivers pictures again, after {at - missing:.1f} s")
                     missing = None
                 _check(taken.picture, self.name)
                 yield Shot(at, taken.picture)
@@ -163,8 +163,8 @@ class LiveSource:
 
 def _check(picture: NDArray[np.uint8], name: str) -> None:
     height, width = picture.shape[:2]
-    if min(height, width) < LEAST_SIDE or max(height, width) > MAX_SIDE or height * width > MAX_PIXELS:
+    if min(height, width) < MIN_SIDE or max(height, width) > MAX_SIDE or height * width > MAX_PIXELS:
         raise BadInput(
-            f"the pictures of {quoted(name)} are {width} by {height} pixels; each side must have {LEAST_SIDE} to "
+            f"the pictures of {quoted(name)} are {width} by {height} pixels; each side must have {MIN_SIDE} to "
             f"{MAX_SIDE} pixels, and all at most {MAX_PIXELS // 1_000_000} million"
         )

@@ -1,4 +1,4 @@
-"""`zscout request --booking`: what a booking has instead of NEEDs and options."""
+"""`zscout request --booking`: the booking determines needs, priority and duration."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from zscout.cli.requests.options import HoldOptions
 from zscout.config.strict import BadInput
 from zscout.keyexpr import valid_name
 
-OWN: Final = ("min_runtime", "release_after", "dry_run")
+EXCLUDED_OPTIONS: Final = ("min_runtime", "release_after", "dry_run")
 
 
 def check_options(**options: Any) -> None:
-    """That none is given that says for how long. Raises BadInput."""
-    for name in OWN:
+    """Check that no option is given that the booking determines. Raises BadInput."""
+    for name in EXCLUDED_OPTIONS:
         if options[name] not in (None, False):
             raise BadInput(f"--{name.replace('_', '-')} can't be used with --booking; leave it out")
 
@@ -26,8 +26,8 @@ def check_options(**options: Any) -> None:
 async def taking_up(
     client: Client, wanted: HoldOptions, *, name: str | None, priority: int | None, yes: bool
 ) -> HoldOptions:
-    """What is asked for to take `wanted.booking` up, a name or an id; called after it, if no `name` was given. Raises
-    BadInput where NEEDs or a `priority` were given that it has not; Failed, RequestRefused."""
+    """Return the request that takes up `wanted.booking`, a name or an id. Without a `name` the request has the
+    booking's. Raises BadInput if needs or `priority` differ from the booking's; Failed, RequestRefused."""
     me = User.of(client)
     booking = choose((await ask_bookings(client)).bookings, wanted.booking, me)
     if booking.maintenance:
