@@ -44,7 +44,7 @@ nonsense | there is no command "nonsense" (see zscout --help)
 requst | there is no command "requst"; did you mean request?
 --fleet none.toml status | none.toml: there is no such file; check the path
 --fleet bad.toml status | bad.toml: fleet.nam: unknown key; did you mean name?
-request robot/a -- | no command follows the --; write one, or leave the -- out
+request robot/a -- | no command follows the --; write a command, or leave the -- out
 request robot/a sleep 5 | device "sleep" is not valid; write kind/name, as in robot/scout33; a command goes after --
 request robot/a --priority high | --priority: "high" is not a whole number
 request robot/a --priority 1.5 | --priority: "1.5" is not a whole number

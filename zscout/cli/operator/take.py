@@ -1,4 +1,4 @@
-"""`zscout take`: an operator's request, which says first from whom it takes."""
+"""`zscout take`: an operator's request, which first lists the holders that it preempts."""
 
 from __future__ import annotations
 
@@ -28,16 +28,18 @@ from zscout.terminal import clean, print_json, print_line
 
 @click.command(cls=CommandAfterDashes)
 @yes_option
-@click.option("--no-keep", is_flag=True, hidden=True, help="--min-runtime is what --release-after is.")
-@click.option("--reason", type=Parsed("text", parse_comment), default="", help="Shown in status and to the preempted.")
+@click.option("--no-keep", is_flag=True, hidden=True, help="Treat --min-runtime like --release-after.")
+@click.option(
+    "--reason", type=Parsed("text", parse_comment), default="", help="A reason, shown in status and to the preempted."
+)
 @hold_options
 @common.runs
 async def take(needs: Any, yes: bool, no_keep: bool, name: str | None, reason: str, comment: str, **rest: Any) -> int:
     """Take devices at the fleet's operator priority, and keep them.
 
-    It prints from whom it takes over, and asks on stderr; if stdin is not a terminal, add --yes. Then it waits, holds
-    and runs a COMMAND as `zscout request` does, with the same exit codes; 1 also if you did not answer y. A DEVICE is
-    written as for `zscout request`, and refused for the same reasons (2).
+    The command lists the holds that it preempts, and asks on stderr; if stdin is not a terminal, add --yes. Then it
+    waits, holds and runs a COMMAND like `zscout request`, with the same exit codes; 1 also if you did not answer y. A
+    DEVICE is written as for `zscout request`, and refused for the same reasons (2).
 
     \b
     Examples:
@@ -49,7 +51,7 @@ async def take(needs: Any, yes: bool, no_keep: bool, name: str | None, reason: s
     terms: dict[str, Any] = {"priority": priority, "keep": not no_keep, "comment": reason or comment}
     wanted = gather(needs, name, DEFAULT_NAMES[1], **terms, **rest)
     async with common.connected("take") as client:
-        # What can never start is refused before anybody is asked about anything.
+        # Refuse a request that can never start before asking the user.
         await client.foresee(wanted.name, wanted.needs, **wanted.terms())
         await _agree(client, wanted, yes=yes)
         return await carry_out(client, wanted)
@@ -57,11 +59,11 @@ async def take(needs: Any, yes: bool, no_keep: bool, name: str | None, reason: s
 
 @dataclass(slots=True)
 class TakeoverCost:
-    """What taking costs others: holds that end for certain, that may end, and that do not yield. Of `either`,
-    by pattern, one must end before it is met."""
+    """The cost of taking devices for others: holds that end for certain, that may end, and that do not yield. `either`:
+    by pattern, holds of which one must end first."""
 
     priority: int
-    """At which it is asked for."""
+    """Priority of the request."""
     ends: list[HoldView] = field(default_factory=list)
     may_end: list[HoldView] = field(default_factory=list)
     stays: list[HoldView] = field(default_factory=list)
@@ -94,7 +96,7 @@ class TakeoverCost:
 
 
 def takeover_cost(state: RcmState, wanted: HoldOptions) -> TakeoverCost:
-    """What would happen if it were asked for now: as the RCM decides, but for the votes of sharable RCs."""
+    """Predict the RCM's decision on `wanted`, except for the votes of sharable RCs."""
     cost = TakeoverCost(wanted.priority)
     for need in contention_of(state, wanted.needs):
         if not need.present:
@@ -128,7 +130,7 @@ def _add(holds: list[HoldView], hold: HoldView) -> None:
 
 
 async def _agree(client: Client, wanted: HoldOptions, *, yes: bool) -> None:
-    """Says whom it will preempt and asks, again where that has changed meanwhile. Raises Failed for a no."""
+    """List the holds to preempt and ask, again if they have changed meanwhile. Raises Failed for a no."""
     agreed: set[tuple[str, str]] = set()
     while True:
         cost = takeover_cost(await common.state_of(client), wanted)
@@ -142,7 +144,7 @@ async def _agree(client: Client, wanted: HoldOptions, *, yes: bool) -> None:
             print_json(preview, sys.stderr if wanted.command else sys.stdout)
         asks = bool(victims) and not yes
         possible = sys.stdin.isatty() and sys.stderr.isatty()
-        # The JSON may go down a pipe: at a question the words are wanted besides.
+        # Before a question print the lines even with --json: the JSON may go into a pipe.
         if not wanted.as_json or (asks and possible):
             for line in cost.lines(User.of(client)):
                 print_line(clean(f"{wanted.name} {line}"), sys.stderr)

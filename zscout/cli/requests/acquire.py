@@ -1,4 +1,4 @@
-"""`zscout acquire`, `run` and `renew`: a hold that lasts over several commands, by its token."""
+"""`zscout acquire`, `run` and `renew`: a hold that outlasts commands, named by a token."""
 
 from __future__ import annotations
 
@@ -42,12 +42,12 @@ from zscout.cli.requests.token_files import FromHolder, ToHolder, TokenChannel, 
 from zscout.config.strict import BadInput, quoted
 from zscout.terminal import clean, clock, print_json, print_line, span
 
-ANSWERS: Final = 10.0
-"""Seconds in which a holder process answers."""
-GIVES_BACK: Final = 60.0
-"""Seconds in which one ends the commands and gives back."""
-HOLDER_ENDS: Final = 10.0
-"""Seconds in which one ends that is not needed any more."""
+ANSWER_TIMEOUT_S: Final = 10.0
+"""For an answer of the holder process."""
+RELEASE_TIMEOUT_S: Final = 60.0
+"""For the holder process to end the commands and release the devices."""
+ABORT_TIMEOUT_S: Final = 10.0
+"""For the end of a holder process that is no longer needed."""
 for_option: Final = click.option(
     "--for",
     "span_",
@@ -58,7 +58,7 @@ for_option: Final = click.option(
 
 
 def _tokens(_ctx: click.Context, _param: click.Parameter, incomplete: str) -> list[str]:
-    """What is offered at Tab."""
+    """Complete a token."""
     return [token for token in token_files.tokens() if token.startswith(incomplete)]
 
 
@@ -66,7 +66,7 @@ token_argument: Final = click.argument("token", metavar="TOKEN", shell_complete=
 
 
 class AcquireCommand(HoldCommand):
-    """It starts itself once more, with the same arguments."""
+    """The command keeps its arguments: it starts itself again with them, as the holder process."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         if "--" in args:
@@ -76,12 +76,14 @@ class AcquireCommand(HoldCommand):
 
 
 @click.command(cls=AcquireCommand)
-@click.option("--starter", type=int, hidden=True, help="The descriptor by which the holder process was started.")
+@click.option(
+    "--starter", type=int, hidden=True, help="Descriptor of the socket to the process that started the holder process."
+)
 @click.option(
     "--follow",
     metavar="PID",
     type=click.IntRange(1),
-    help="Give the devices back when this process ends, as the shell of a job: $$. Default in a GitLab job: its shell.",
+    help="Release the devices when this process ends, as the shell of a job: $$. Default in a GitLab job: its shell.",
 )
 @priority_option
 @tolerate_option
@@ -91,15 +93,15 @@ class AcquireCommand(HoldCommand):
 async def acquire(
     needs: Any, span_: Decimal, follow: int | None, starter: int | None, name: str | None, **rest: Any
 ) -> int:
-    """Wait for devices and hold them for the commands that follow: prints a token and returns.
+    """Wait for devices and hold them for the commands that follow; print a token and return.
 
-    A process in the background of this host holds the devices until `zscout release TOKEN`, or until the time of
-    --for is over. `zscout run TOKEN -- COMMAND` runs commands under the hold, in later steps of a job or in another
-    terminal of the same user; `zscout renew TOKEN --for 1h` extends it. The hold is protected from requests of equal
-    priority for the time of --for.
+    A background process on this host holds the devices until `zscout release TOKEN`, or until the time of --for is
+    over. `zscout run TOKEN -- COMMAND` runs commands under the hold, in later steps of a job or in another terminal of
+    the same user; `zscout renew TOKEN --for 1h` extends it. The hold is protected from requests of equal priority for
+    the time of --for.
 
-    The devices are given back as well when the holder process ends, by whatever signal, and with --follow when that
-    process does. Nothing but the token goes to stdout; a DEVICE, and the exit codes, are those of `zscout request`.
+    The devices are also released when the background process ends, by any signal, and with --follow when that
+    process ends. Only the token is printed on stdout; DEVICE and the exit codes are those of `zscout request`.
 
     \b
     Examples:
@@ -121,14 +123,14 @@ async def acquire(
 
 
 def _job_process() -> int | None:
-    """The shell of a GitLab job, which leads the group of all that the job starts. Other CI services end what a job
-    left by its environment, and run each step in a shell of its own."""
+    """Return the shell of a GitLab job, which leads the process group of the job. Other CI services run each step in a
+    shell of its own, and find leftover processes by their environment."""
     group = os.getpgrp()
     return group if os.environ.get("GITLAB_CI") and group not in (0, os.getpid()) else None
 
 
 async def _start(follow: int | None, json_file: str | None, *, as_json: bool) -> int:
-    """Start the holder process, and print the token that it sends. Returns its exit code where it sends none."""
+    """Start the holder process, and print the token that it sends. Return its exit code if it sends none."""
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     context = click.get_current_context()
     fleet = common.fleet_file()
@@ -156,9 +158,9 @@ async def _start(follow: int | None, json_file: str | None, *, as_json: bool) ->
             channel.send(ToHolder("printed"))
             return 0
     except BaseException:
-        channel.close()  # it gives up
+        channel.close()  # the holder process then gives up
         with suppress(subprocess.TimeoutExpired):
-            process.wait(HOLDER_ENDS)
+            process.wait(ABORT_TIMEOUT_S)
         raise
     code = await asyncio.to_thread(process.wait)
     if code < 0:
@@ -170,7 +172,7 @@ async def _start(follow: int | None, json_file: str | None, *, as_json: bool) ->
 
 
 class UsedToken:
-    """The token that a command is given. Raises BadInput, or Failed where its hold has ended."""
+    """The token of a command, connected to its holder process. Raises BadInput, or Failed if its hold has ended."""
 
     def __init__(self, token: str) -> None:
         path = token_files.find(token)
@@ -190,14 +192,14 @@ class UsedToken:
         self.channel: TokenChannel = channel
 
     async def receive(self) -> FromHolder | None:
-        """The next word of the holder process; None: it has ended."""
+        """Return the next message of the holder process; None: it has ended."""
         received = await self.channel.receive(FromHolder)
         return received[0] if received is not None else None
 
     async def answer(self) -> FromHolder:
-        """The same, soon. Raises Failed."""
+        """Return the next message within ANSWER_TIMEOUT_S. Raises Failed for a refusal, the end or no message."""
         try:
-            async with asyncio.timeout(ANSWERS):
+            async with asyncio.timeout(ANSWER_TIMEOUT_S):
                 word = await self.receive()
         except TimeoutError:
             raise Failed(f"the holder process {self.file.pid} of {self.file.arc} does not answer; try again") from None
@@ -210,13 +212,13 @@ class UsedToken:
         return word
 
 
-DIED: Final = "its holder process has gone, and the devices are given back"
+DIED: Final = "its holder process has ended, and the devices are released"
 
 
 def _known() -> str:
     known = token_files.tokens()
-    listed = f"; known here: {', '.join(known[:8])}" if known else ", and there is none of yours on this host"
-    return f"{listed}; a token is good for the same user on the same host"
+    listed = f"; known here: {', '.join(known[:8])}" if known else ", and you have no token on this host"
+    return f"{listed}; a token works for the same user on the same host"
 
 
 @click.command(cls=CommandAfterDashes)
@@ -228,18 +230,18 @@ def _known() -> str:
 async def run(token: str, grace: Decimal | None, infra_exit: int | None, notify_signal: int | None) -> int:
     """Run a command under the hold of a token that `zscout acquire` printed.
 
-    The command finds the same variables in its environment as with `zscout request -- COMMAND`, and ends as it does
-    there: when its hold ends, it and its processes get SIGTERM, and SIGKILL after the grace; the same happens if zscout
-    or the process that holds dies or hangs. When it ends by itself, the devices stay held. Several commands may run
+    The command gets the same environment variables as with `zscout request -- COMMAND`, and is ended in the same way:
+    when its hold ends, the command and its processes get SIGTERM, and SIGKILL after the grace; also if zscout or the
+    holder process dies or hangs. When the command ends by itself, the devices stay held. Several commands may run
     under one token at a time.
 
     \b
     Exit code: the command's own (128 + n: ended by signal n), or
-      75   the devices were taken away, or given back by another command
+      75   the devices were taken away, or released by another command
       124  the time of --for was over
-      126  it can't be executed           127  there is no such command
-      1    the process that holds does not answer     2    there is no such token
-    With --infra-exit N it is N instead of 1, 2, 75 and 124: all else is the command's own.
+      126  the command can't be executed       127  there is no such command
+      1    the holder process does not answer  2    there is no such token
+    With --infra-exit N it is N instead of 1, 2, 75 and 124: all other codes are the command's own.
 
     \b
     Examples:
@@ -273,7 +275,7 @@ async def _run(
     infra_exit: int | None,
     notify_signal: int | None,
 ) -> int:
-    """Under the hold. `kept` is closed."""
+    """Run a command under the hold. Closes `kept`."""
     ended: FromHolder | None = None
     running = RunningCommand(command, os.environ | begun.env, grace, begun.at, kept)
 
@@ -313,10 +315,10 @@ async def _run(
 @json_option("Print one JSON object.")
 @common.runs
 async def renew(token: str, span_: Decimal, as_json: bool, infra_exit: int | None) -> None:
-    """Hold the devices of a token for at most this long from now.
+    """Hold the devices of a token for at most the time of --for from now.
 
-    The hold is protected for the time that it was acquired for. After that you keep the devices until a request of
-    equal or higher priority waits for one of them: acquire them for longer if that must not be.
+    Only the time of `zscout acquire --for` is protected. After it you keep the devices until a request of equal or
+    higher priority waits for one of them: if you need them longer, acquire them for longer.
 
     \b
     Examples:
@@ -338,7 +340,8 @@ async def renew(token: str, span_: Decimal, as_json: bool, infra_exit: int | Non
 
 
 async def release_token(token: str) -> TokenFile | None:
-    """End the hold of a token, if this is one; None: it is none. A hold that has ended is forgotten. Raises Failed."""
+    """End the hold of a token, and remove its file if the hold has ended already. Return None if `token` is no token.
+    Raises Failed."""
     path = token_files.find(token)
     if path is None:
         return None
@@ -352,7 +355,7 @@ async def release_token(token: str) -> TokenFile | None:
         return file if file.ended else msgspec.structs.replace(file, ended=DIED)
     channel.send(ToHolder("release"))
     try:
-        async with asyncio.timeout(GIVES_BACK):
+        async with asyncio.timeout(RELEASE_TIMEOUT_S):
             received = await channel.receive(FromHolder)
     except TimeoutError:
         raise Failed(

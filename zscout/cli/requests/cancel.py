@@ -1,4 +1,4 @@
-"""`zscout cancel` and `release`: the end of an ARC at somebody's word."""
+"""`zscout cancel` and `release`: end requests and holds."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from zscout.keyexpr import USERS, check_name, client_of
 from zscout.messages import Cancel, Notice, RcmState, Release, Who
 
 MAX_LISTED: Final = 20
-"""ARCs of one name, where one has to be chosen."""
+"""ARCs of one name that an error lists."""
 TRIES: Final = 3
-TIMEOUT: Final = 1.0
+TIMEOUT_S: Final = 1.0
 
-every_option = click.option("--all", "every", is_flag=True, help="All requests of that name, not only one.")
+every_option = click.option("--all", "every", is_flag=True, help="End all requests of that name.")
 
 
 @click.command()
@@ -31,11 +31,11 @@ every_option = click.option("--all", "every", is_flag=True, help="All requests o
 @common.json_option("Print one JSON object.")
 @common.runs
 async def cancel(arc: str, every: bool, yes: bool, as_json: bool) -> None:
-    """End a request, whether it holds or waits: by name, id, or <host>/<client>/<id>.
+    """End a request, whether it holds or waits. Name it by name, id, or <host>/<client>/<id>.
 
-    Its program is notified; a program that `zscout request` runs is stopped. If several requests have the name, it is
-    refused with the list of them, unless --all is given. It asks before it ends another user's request; if stdin is
-    not a terminal, add --yes. In a secured fleet only operators may.
+    Its program is notified; a command that `zscout request` runs is stopped. If several requests have the name, the
+    command lists them and ends none, unless --all is given. Before it ends another user's request it asks; if stdin is
+    not a terminal, add --yes. In a secured fleet only operators may end others' requests.
 
     \b
     Examples:
@@ -53,11 +53,11 @@ async def cancel(arc: str, every: bool, yes: bool, as_json: bool) -> None:
 @common.json_option("Print one JSON object.")
 @common.runs
 async def release(arc: str, every: bool, yes: bool, as_json: bool) -> None:
-    """End the hold of a request: by name, id, or <host>/<client>/<id>; or by the token of `zscout acquire`.
+    """End the hold of a request. Name it by name, id, or <host>/<client>/<id>, or by the token of `zscout acquire`.
 
-    The same as `zscout cancel`, with the same question, but it leaves a waiting request alone. If several requests
-    have the name, it is refused, unless --all is given. With a token it ends the commands that run under it first,
-    and it is no failure if the hold has ended.
+    Like `zscout cancel`, with the same question, but a waiting request keeps waiting. If several requests have the
+    name, none is ended, unless --all is given. With a token the commands that run under it are ended first; a hold
+    that has already ended is no error.
 
     \b
     Examples:
@@ -78,7 +78,7 @@ async def release(arc: str, every: bool, yes: bool, as_json: bool) -> None:
 
 
 class Target(NamedTuple):
-    """An ARC to be ended. `was` is `running` or `queued`."""
+    """An ARC to end. `was`: `running` or `queued`."""
 
     arc: str
     id: str
@@ -120,12 +120,12 @@ async def _end(named: str, word: str, *, every: bool, yes: bool, as_json: bool) 
 
 
 def _choose(state: RcmState, named: str, word: str, *, every: bool) -> list[Target]:
-    """The ARCs that are meant. Raises Failed where there is none, or more than one without `every`."""
+    """Return the ARCs that `named` means. Raises Failed if there is none, or, without `every`, more than one."""
     known = [Target(hold.arc, hold.id, hold.client, "running", hold.who) for hold in state.holds]
     known += [Target(wait.arc, wait.id, wait.client, "queued", wait.who) for wait in state.queue]
     matching = [target for target in known if named in (target.arc, target.id, target.full_name)]
     if not matching and state.more and named.count("/") == 2:
-        # The answer leaves out the end of a long queue; a full name is enough to end it all the same.
+        # The answer leaves out the end of a long queue; a full name is enough to end a request there.
         client, _, request = named.rpartition("/")
         matching = [Target(request, check_name(request, "id"), str(client_of(client)), "queued")]
     found = [target for target in matching if word == "cancel" or target.was == "running"]
@@ -133,22 +133,25 @@ def _choose(state: RcmState, named: str, word: str, *, every: bool) -> list[Targ
         raise common.Failed(f"request {quoted(named)} holds nothing, it waits; to cancel it: zscout cancel {named}")
     if not found:
         more = f"; {state.more} more wait: name them <host>/<client>/<id>" if state.more else ""
-        raise common.Failed(f"no request {quoted(named)} holds or waits{more}; {_instead(state, named)}")
+        raise common.Failed(f"no request {quoted(named)} holds or waits{more}; {_hint(state, named)}")
     if len(found) > 1 and not every:
         listed = ", ".join(f"{target.full_name} ({target.was})" for target in found[:MAX_LISTED])
         rest = f" and {len(found) - MAX_LISTED} more" if len(found) > MAX_LISTED else ""
-        raise common.Failed(f"{len(found)} requests are called {quoted(named)}: {listed}{rest}; name one, or add --all")
+        raise common.Failed(
+            f"{len(found)} requests are called {quoted(named)}: {listed}{rest}; "
+            "name one by <host>/<client>/<id>, or add --all"
+        )
     return found
 
 
-def _instead(state: RcmState, named: str) -> str:
+def _hint(state: RcmState, named: str) -> str:
     if rc := common.device_named(state, named):
         return f"{rc} is a device: zscout status {rc} shows which requests hold it or wait"
     return "see zscout status, or zscout booking list for bookings"
 
 
 async def _operate(client: Client, target: Target, word: str) -> Notice:
-    """Has the RCM end one ARC; asking twice does no harm. Raises Failed, NobodyThere."""
+    """Let the RCM end an ARC. Retries are safe. Raises Failed, NobodyThere."""
     own = client.mesh.me.host
     if client.mesh.keys.closed and (why := client.fleet.access.refusal(own, "end requests", USERS)):
         raise common.Failed(f"{target.full_name} was not ended: {why}")
@@ -156,7 +159,7 @@ async def _operate(client: Client, target: Target, word: str) -> Notice:
     key = client.mesh.keys.schedule(client.mesh.me)
     for _ in range(TRIES):
         replies = await client.mesh.ask(
-            key, operation, Notice, timeout=TIMEOUT, enough=lambda reply: reply.message is not None
+            key, operation, Notice, timeout=TIMEOUT_S, enough=lambda reply: reply.message is not None
         )
         notices = [reply.message for reply in replies if reply.message is not None]
         if notices:
@@ -164,4 +167,4 @@ async def _operate(client: Client, target: Target, word: str) -> Notice:
         problem = next((reply.problem for reply in replies if reply.problem is not None), None)
         if problem is not None and problem.code not in TRY_AGAIN:
             raise common.Failed(f"{target.full_name} was not ended: {problem.message}")
-    raise common.NobodyThere("the leader did not answer; it may or may not have been done: see zscout status")
+    raise common.NobodyThere("the leader did not answer; the request may or may not have ended: see zscout status")

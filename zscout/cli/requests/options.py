@@ -1,4 +1,4 @@
-"""What people write on the command line, read strictly: durations, needs, options of what holds something."""
+"""Parse the command line strictly: durations, needs, options of commands that hold devices."""
 
 from __future__ import annotations
 
@@ -36,14 +36,14 @@ INFRA_EXIT: Final = "--infra-exit"
 EXIT_CODES: Final = range(1, 256)
 MAX_PRIORITY: Final = 1_000_000
 DEFAULT_NAMES: Final = ("request", "operator", "acquire")
-"""What ARCs of `zscout request`, `take` and `acquire` are called that run no command."""
+"""Names of ARCs of `zscout request`, `take` and `acquire` without a command."""
 MAX_ARC_NAME: Final = 200
 """Characters of `<host>/<client>/<id>`, the longest name of an ARC."""
 _NUMBER: Final = re.compile(r"[0-9]{1,19}(\.[0-9]{1,18})?|\.[0-9]{1,18}")
 
 
 def parse_duration(text: str, what: str, *, zero: bool = False) -> Decimal:
-    """Seconds from `5`, `1.5`, `300ms`, `90s`, `5m`, `2h` or `1d12h`. Raises BadInput."""
+    """Parse `5`, `1.5`, `300ms`, `90s`, `5m`, `2h` or `1d12h`; return seconds. Raises BadInput."""
     seconds = strict.parse_duration(text)
     if seconds is None:
         raise BadInput(f"{what}: {quoted(text)} is not a duration; write {DURATIONS}")
@@ -57,12 +57,12 @@ def parse_duration(text: str, what: str, *, zero: bool = False) -> Decimal:
 
 
 def timeout_option(help: str, *, zero: bool = False) -> Callable[[F], F]:  # noqa: A002 - click's word
-    """The `--timeout` option, in seconds; with `zero`, 0 may be written too."""
+    """The `--timeout` option, in seconds. `zero`: 0 is allowed."""
     return click.option("--timeout", type=SECONDS_OR_0 if zero else SECONDS, help=help)
 
 
 def seconds_within(low: float, high: float) -> Parsed[float]:
-    """An option's duration, in seconds."""
+    """A parameter type for a duration between `low` and `high` seconds."""
 
     def parse(text: str, option: str) -> float:
         seconds = float(parse_duration(text, option, zero=low == 0))
@@ -74,12 +74,12 @@ def seconds_within(low: float, high: float) -> Parsed[float]:
 
 
 SECONDS: Final = Parsed("duration", lambda text, option: float(parse_duration(text, option)))
-"""An option's duration of any length, in seconds."""
+"""A parameter type for a duration above 0, in seconds."""
 SECONDS_OR_0: Final = Parsed("duration", lambda text, option: float(parse_duration(text, option, zero=True)))
 
 
 def parse_comment(text: str, option: str) -> str:
-    """A comment as others are shown it. Raises BadInput."""
+    """Check a comment, and return it as other users see it. Raises BadInput."""
     try:
         return checked_comment(text)
     except ValueError as error:
@@ -87,7 +87,7 @@ def parse_comment(text: str, option: str) -> str:
 
 
 def parse_rc(text: str, kind: str, *, pattern: bool = False) -> str:
-    """An RC of one kind: `robot/scout33` or `scout33`, with `pattern` also `robot/*`. Raises BadInput, BadName."""
+    """Parse an RC of `kind`: `robot/scout33`, `scout33`, with `pattern` also `robot/*`. Raises BadInput, BadName."""
     rc = text if "/" in text else f"{kind}/{text}"
     if rc.partition("/")[0] != kind or (is_pattern(rc) and not pattern):
         raise BadInput(f"{quoted(text)} is not a {kind}; name one, as in {kind}/NAME")
@@ -96,7 +96,7 @@ def parse_rc(text: str, kind: str, *, pattern: bool = False) -> str:
 
 
 def parse_need(text: str, _option: str = "") -> tuple[str, dict[str, Decimal]]:
-    """`robot/scout33`, a pattern such as `framegrabber/*`, or `radio/rf0:command_rate=5,other=1`. Raises BadInput."""
+    """Parse `robot/scout33`, `framegrabber/*` or `radio/rf0:command_rate=5,other=1`. Raises BadInput."""
     rc, colon, rest = text.partition(":")
     params: dict[str, Decimal] = {}
     try:
@@ -124,12 +124,12 @@ def parse_need(text: str, _option: str = "") -> tuple[str, dict[str, Decimal]]:
 
 
 def gather_needs(pairs: Sequence[tuple[str, dict[str, Decimal]]]) -> Needs:
-    """The needs of one ARC; a pattern that comes again is numbered: `framegrabber/*#2` is the second. Raises BadInput
-    where there are too many, one RC is named twice, or patterns contradict each other."""
+    """Collect the needs of an ARC; a repeated pattern is numbered: `framegrabber/*#2` is the second. Raises BadInput
+    for too many needs, an RC named twice, or patterns that contradict each other."""
     if len(pairs) > MAX_NEEDS:
         raise BadInput(f"{len(pairs)} devices; at most {MAX_NEEDS} are allowed in one request")
     needs: Needs = {}
-    # Numbers that are written out are not given to others.
+    # Don't reuse numbers that the user wrote.
     written = {need for need, _ in pairs}
     for need, params in pairs:
         name = need
@@ -139,7 +139,7 @@ def gather_needs(pairs: Sequence[tuple[str, dict[str, Decimal]]]) -> Needs:
             if "#" in need:
                 raise BadInput(f"{need} is named twice; leave the numbers out: zscout numbers them")
             numbered = (f"{need}#{number}" for number in range(2, MAX_NEEDS + 2))
-            name = next(one for one in numbered if one not in needs and one not in written)
+            name = next(free for free in numbered if free not in needs and free not in written)
         needs[name] = params
     try:
         check_patterns({need: messages.exact_amounts(params) for need, params in needs.items()})
@@ -148,7 +148,7 @@ def gather_needs(pairs: Sequence[tuple[str, dict[str, Decimal]]]) -> Needs:
     return needs
 
 
-# Commands that hold something
+# Commands that hold devices
 
 
 def is_descriptor(target: str) -> bool:
@@ -156,17 +156,17 @@ def is_descriptor(target: str) -> bool:
 
 
 class EventFile:
-    """Where `--json-file` writes events: a file, a FIFO with a reader, or an open descriptor."""
+    """The target of `--json-file`: a file, a FIFO with a reader, or an open descriptor."""
 
     def __init__(self, target: str) -> None:
-        """Raises BadInput where nothing can be written there."""
+        """Raises BadInput if it can't be written."""
         self.given = is_descriptor(target)
         try:
             if self.given:
                 self.fd = int(target)
                 os.fstat(self.fd)
             else:
-                # A FIFO without a reader is refused instead of waited for; a full one loses events.
+                # Don't block on a FIFO: without a reader it is refused, and a full FIFO loses events.
                 flags = os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC | os.O_NONBLOCK
                 self.fd = os.open(target, flags, 0o666)
             os.write(self.fd, b"")
@@ -175,18 +175,18 @@ class EventFile:
             raise BadInput(f"--json-file {quoted(target)} can't be written ({why}); give another file") from None
 
     def close_given(self) -> None:
-        """Close a descriptor that was given: its reader waits for the end."""
+        """Close a descriptor that the caller passed: its reader waits for the end."""
         if self.given:
             os.close(self.fd)
 
     def write(self, event: Mapping[str, Any]) -> None:
-        """Write one event as a line. What zscout does does not depend on who reads it."""
+        """Write one event as a line; errors are ignored, so a reader can't disturb the command."""
         with suppress(OSError):
             os.write(self.fd, f"{json_text(event)}\n".encode())
 
 
 class HoldCommand(click.Command):
-    """A command with `--infra-exit` and `--json-file`: how it fails is known to both."""
+    """A command with `--infra-exit` and `--json-file`, which apply to all its failures."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         ctx.meta["infra_exit"] = _infra_exit_in(args)
@@ -199,8 +199,8 @@ class HoldCommand(click.Command):
 
 
 def _infra_exit_in(args: Sequence[str]) -> int | None:
-    """The value of --infra-exit, read before all other options, any of which may be wrong. None if it has none, or
-    a bad one, which is refused with the others."""
+    """Return the value of --infra-exit before other options are parsed, since any of them may be wrong. None if it is
+    missing or bad; click then reports it."""
     for at, arg in enumerate(args):
         name, equals, value = arg.partition("=")
         if name == INFRA_EXIT:
@@ -211,7 +211,7 @@ def _infra_exit_in(args: Sequence[str]) -> int | None:
 
 @contextmanager
 def _own_failures(ctx: click.Context) -> Iterator[None]:
-    """Write a failure to --json-file, and raise InfraExit for it, where these options are given."""
+    """Write a failure to --json-file, and raise InfraExit for it, if these options are given."""
     try:
         yield
     except (click.exceptions.Exit, click.Abort, Interrupted):
@@ -237,7 +237,7 @@ class CommandAfterDashes(HoldCommand):
             at = args.index("--")
             args, command = args[:at], args[at + 1 :]
             if not command and not ctx.resilient_parsing:
-                raise click.UsageError("no command follows the --; write one, or leave the -- out", ctx)
+                raise click.UsageError("no command follows the --; write a command, or leave the -- out", ctx)
             ctx.meta["command"] = tuple(command)
         return super().parse_args(ctx, args)
 
@@ -247,13 +247,13 @@ class CommandAfterDashes(HoldCommand):
 
 @dataclass(frozen=True, slots=True)
 class HoldOptions:
-    """What was asked for on the command line. `timeout` and `grace` in seconds."""
+    """The options of a command that holds devices. `timeout` and `grace` in seconds."""
 
     name: str
     needs: Needs
     priority: int
     min_runtime: Decimal | None
-    """None: the fleet's."""
+    """None: the fleet's default."""
     keep: bool
     timeout: float | None
     grace: Decimal | None
@@ -263,22 +263,22 @@ class HoldOptions:
     comment: str = ""
     wait_for_device: bool = False
     tolerate: float | None = None
-    """Seconds for which devices may be unwell under the hold; None: as each device has it."""
+    """Seconds for which devices may be unwell under the hold; None: each device's setting."""
     booking: str = ""
-    """The id of the booking that it takes up."""
+    """Id of the booking to take up."""
     infra_exit: int | None = None
     notify_signal: int | None = None
-    """The signal for the command when its hold is to yield."""
+    """Signal to the command when a notice announces the end of the hold."""
     events: EventFile | None = None
     direct: bool = False
-    """Whether programs touch the devices past zscout; those of a command do."""
+    """True if programs access the devices directly, past zscout; commands do."""
 
     def own_code(self, code: int) -> int:
-        """The exit code where it is zscout's own that would be `code`."""
+        """Return the exit code for a failure of zscout's own: --infra-exit, else `code`."""
         return code if self.infra_exit is None else self.infra_exit
 
     def asked_by(self, who: Who | None) -> Who:
-        """Who asks, of whom only zscout's own command is known yet: for which command, or under which name."""
+        """Complete `who`, which has only zscout's own command, with the user's command or the request's name."""
         who = who or Who()
         called = f"--booking {self.name}" if self.booking else f"--name {self.name}"
         own = f"{who.command} {called}" if self.name not in DEFAULT_NAMES else who.command
@@ -290,13 +290,13 @@ class HoldOptions:
 
 
 def hold_options(command: F, *, needs_required: bool = True, runs_command: bool = True) -> F:
-    """The NEEDs and the options of commands that hold something; `runs_command`: those that may run a command too."""
+    """Add needs and options of commands that hold devices; `runs_command`: also the options for a command."""
     of_commands = (
         click.option("--again", is_flag=True, help="Repeat request and command if the devices were taken away."),
         click.option(
             "--release-after",
             type=Parsed("duration", parse_duration),
-            help="Give the devices back after this time, even if nobody waits; instead of --min-runtime.",
+            help="Release the devices after this time, even if no request waits; instead of --min-runtime.",
         ),
         grace_option,
         notify_signal_option,
@@ -316,14 +316,12 @@ def hold_options(command: F, *, needs_required: bool = True, runs_command: bool 
             metavar="DEVICE...",
             shell_complete=completion.needs,
         ),
-        json_option("Print JSON lines, one for each event."),
-        click.option("--wait-for-device", is_flag=True, help="Wait for devices that are unknown, too."),
+        json_option("Print one JSON object on a line for each event."),
+        click.option("--wait-for-device", is_flag=True, help="Also wait for unknown devices."),
         *(of_commands if runs_command else ()),
         infra_exit_option,
         click.option(
-            "--json-file",
-            metavar="PATH|FD",
-            help="Write the events of --json to a file or an open descriptor, beside what people read.",
+            "--json-file", metavar="PATH|FD", help="Also write the events of --json to this file or open descriptor."
         ),
         timeout_option("Wait this long for a grant, then exit with 1; 0: try once.", zero=True),
         click.option(
@@ -344,13 +342,13 @@ NAMES_OF_COMMANDS: Final = "the command's name, else request (take: operator)"
 grace_option: Final = click.option(
     "--grace",
     type=Parsed("duration", partial(parse_duration, zero=True)),
-    help="Time from SIGTERM to SIGKILL for the command: at most, and by default, nine tenths of what devices settle "
-    "(`settle`, 5 s).",
+    help="Time from SIGTERM to SIGKILL for the command: at most, and by default, nine tenths of the devices' settling "
+    "time (`settle`, 5 s).",
 )
 
 
 def parse_signal(text: str, option: str) -> int:
-    """`USR1`, `SIGUSR1` or a number. Raises BadInput."""
+    """Parse `USR1`, `SIGUSR1` or a number. Raises BadInput."""
     name = text.upper().removeprefix("SIG")
     known = {found.name.removeprefix("SIG"): int(found) for found in signal.Signals}
     number = int(name) if name.isascii() and name.isdigit() else known.get(name, 0)
@@ -370,7 +368,7 @@ infra_exit_option: Final = click.option(
     INFRA_EXIT,
     type=click.IntRange(EXIT_CODES[0], EXIT_CODES[-1]),
     metavar="N",
-    help="Exit with N wherever zscout fails, not the command: for 1, 2, 3, 75 and 124.",
+    help="Exit with N if zscout fails, not the command: instead of 1, 2, 3, 75 and 124.",
 )
 priority_option: Final = click.option(
     "--priority",
@@ -384,7 +382,7 @@ tolerate_option: Final = click.option(
 
 
 def grace_within(asked: Decimal | None, most: float) -> tuple[float, str]:
-    """The grace, and a line for people if it is less than `asked`."""
+    """Return the grace in seconds, and a line for the user if it is less than `asked`."""
     if asked is None or asked <= most:
         return most if asked is None else float(asked), ""
     text = f"--grace {span(float(asked))} is more than the devices allow: SIGKILL follows {span(most)} after SIGTERM"
@@ -401,7 +399,7 @@ def gather(
     json_file: str | None,
     **rest: Any,
 ) -> HoldOptions:
-    """Checks what can be checked before anybody is asked. Raises UsageError, BadInput, BadName, Failed."""
+    """Check the options that need no fleet. Raises UsageError, BadInput, BadName, Failed."""
     context = click.get_current_context()
     if json_file is not None:
         rest["events"] = context.meta["events"] = EventFile(json_file)
@@ -429,7 +427,7 @@ def gather(
 
 
 def arc_named(text: str, _option: str) -> str:
-    """What may be an ARC's name, its id or `<host>/<client>/<id>`. Raises BadInput."""
+    """Check the name of an ARC, its id or `<host>/<client>/<id>`. Raises BadInput."""
     if not text or len(text) > MAX_ARC_NAME or not text.isprintable():
         raise BadInput(f"{quoted(text)} can't be the name of a request; see zscout status")
     return text

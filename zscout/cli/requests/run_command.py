@@ -1,8 +1,8 @@
-"""A command that runs under a grant: started by its guardian, ended as a whole.
+"""Run a command under a grant: its guardian starts it, and it is ended with all its processes.
 
-At a terminal it has the foreground, so that Ctrl-C and job control are its own (else Ctrl-C reaches `cli/common.run`,
-which cancels the request); it can't be suspended with Ctrl-Z, as what it holds would stand idle. In a pipeline it gets
-the terminal when it asks for it.
+At a terminal the command has the foreground, so that it receives Ctrl-C (otherwise Ctrl-C reaches `cli/common.run`,
+which cancels the request). Ctrl-Z can't suspend it, since its devices would be idle. In a pipeline it gets the terminal
+when it asks for it.
 """
 
 from __future__ import annotations
@@ -32,17 +32,17 @@ if TYPE_CHECKING:
     from zscout.behaviors.client.arc import Held
     from zscout.behaviors.client.client import Client
 
-LOOK_AGAIN: Final = 0.3
-"""Seconds between two looks at a terminal, which reports no changes."""
+TERMINAL_RETRY_S: Final = 0.3
+"""Interval between attempts to get a terminal, which reports no changes."""
 COMMAND_CODES: Final = (NOT_EXECUTABLE, NOT_FOUND)
-"""Exit codes by which a shell says as well that it can't run a command."""
+"""Exit codes that shells also use for a command that can't be run."""
 KILLED: Final = -signal.SIGKILL
-CANT_FIND: Final = "/proc shows no processes, and one that it has started still runs: end it by hand"
-CANT_END: Final = "runs as another user and can't be ended: end it by hand"
+PROCESSES_HIDDEN: Final = "/proc shows no processes, but a process of the command still runs: end it by hand"
+CANNOT_END: Final = "runs as another user and can't be ended: end it by hand"
 
 
 def check_command(command: Sequence[str]) -> None:
-    """Raises Failed where a command can't be run, before anybody waits for devices: 127, or 126."""
+    """Check that a command can be run, before waiting for devices. Raises Failed with exit code 126 or 127."""
     name = command[0]
     if shutil.which(name) is not None:
         return
@@ -52,7 +52,7 @@ def check_command(command: Sequence[str]) -> None:
 
 
 def environment(held: Held, client: Client) -> dict[str, str]:
-    """This process's environment, and what a command needs to use what it holds."""
+    """Return this process's environment with the variables of the hold."""
     return os.environ | hold_variables(held, client)
 
 
@@ -73,10 +73,11 @@ def hold_variables(held: Held, client: Client) -> dict[str, str]:
 
 
 class RunningCommand:
-    """A command from its start to the end of the last process that came of it. Use as an async context manager:
-    whatever happens in the body, nothing of it is left afterwards.
+    """A command, from its start to the end of its last process. An async context manager: at its exit no process of the
+    command is left.
 
-    `grace` in seconds, `until` as `hold_until` has it; `kept`: a descriptor that its guardian keeps open until then."""
+    grace: seconds from SIGTERM to SIGKILL. until: as of `hold_until`. kept: a descriptor that the guardian keeps open
+    until all processes have ended."""
 
     def __init__(
         self,
@@ -94,18 +95,18 @@ class RunningCommand:
         self._timer: asyncio.TimerHandle | None = None
         self._channel, self._theirs = socket.socketpair()
         self._received = b""
-        self._noted = self._told = self._exited = False
+        self._noted = self._terminated = self._exited = False
         self._code = KILLED
         self._stuck = asyncio.Event()
         self.pid = 0
-        """Of the command, and of its process group."""
+        """Id of the command's process and of its process group."""
         self.why_ended = ""
-        """Why the guardian ended it: `deadline`, `client`, `signal`; empty: it ended by itself."""
+        """The reason that the guardian ended it: `deadline`, `client`, `signal`; empty: it ended by itself."""
         if until is not None:
             self.hold_until(until)
 
     async def __aenter__(self) -> Self:
-        # All that comes of the command is ours, should the guardian be killed.
+        # If the guardian is killed, this process inherits the command's processes.
         be_subreaper()
         self._channel.setblocking(False)
         self._loop.add_reader(self._channel, self._receive)
@@ -137,12 +138,13 @@ class RunningCommand:
             self._close()
 
     def hold_until(self, at: Ns) -> None:
-        """The command is ended then, by the clock of a fleet's programs, unless a later time is given before."""
-        self._say(f"until {at}")
+        """End the command at this time, by the monotonic clock of the fleet's programs, unless a later time is given
+        before."""
+        self._send(f"until {at}")
 
     async def wait(self) -> int:
-        """Waits until nothing of the command is left: what it left running is ended with it. Its own exit code,
-        128 + n where signal n ended it."""
+        """Wait until no process of the command is left: processes that it left running are ended. Return its exit code,
+        128 + n if signal n ended it."""
         await self._wait_until_gone()
         return self._code if self._code >= 0 else 128 - self._code
 
@@ -151,23 +153,23 @@ class RunningCommand:
         return self._gone.done()
 
     def signal(self, number: int) -> None:
-        """Send a signal to the command itself, once it catches that."""
-        self._say(f"signal {number}")
+        """Send a signal to the command's own process, as soon as it catches that signal."""
+        self._send(f"signal {number}")
 
     def terminate(self, at: Ns) -> None:
-        """SIGTERM to all of it; SIGKILL follows a grace after `at`. Once, however often it is called."""
-        if not self._told:
-            self._told = True
-            self._say(f"end {at}")
+        """Send SIGTERM to all its processes; SIGKILL follows a grace after `at`. Further calls do nothing."""
+        if not self._terminated:
+            self._terminated = True
+            self._send(f"end {at}")
 
     async def end(self) -> None:
-        """Ends all of it, and returns when it has ended: SIGTERM, and SIGKILL after the grace or where this is
-        cancelled. What runs as another user and can't be ended is named, and left."""
+        """End all its processes, and return when they have ended: SIGTERM, then SIGKILL after the grace or when this is
+        cancelled. Processes of another user that can't be ended are reported and left."""
         self.terminate(now())
         try:
             await first_of(self._wait_until_gone(), self._stuck.wait())
         except asyncio.CancelledError:
-            self._say("kill")
+            self._send("kill")
             await first_of(self._wait_until_gone(), self._stuck.wait())
             raise
 
@@ -185,10 +187,10 @@ class RunningCommand:
             self._tty.take_back(self.pid, restore=self._code != 0)
         self._tty.close()
 
-    # The guardian's words
+    # The guardian's protocol
 
-    def _say(self, words: str) -> None:
-        with contextlib.suppress(OSError):  # it has ended
+    def _send(self, words: str) -> None:
+        with contextlib.suppress(OSError):  # the guardian has ended
             self._channel.send(f"{words}\n".encode())
 
     def _receive(self) -> None:
@@ -219,7 +221,7 @@ class RunningCommand:
             case "ending" if not self._exited:
                 self.why_ended = number
             case "stuck":
-                process = f"process {number} {CANT_END}" if number != "0" else CANT_FIND
+                process = f"process {number} {CANNOT_END}" if number != "0" else PROCESSES_HIDDEN
                 print_line(f"zscout: {self._command[0]}: {process}", sys.stderr)
                 self._stuck.set()
             case "gone":
@@ -231,16 +233,16 @@ class RunningCommand:
 
     def _sweep(self, pause: float) -> None:
         left = descendants(os.getpid())
-        for one in left:
+        for process in left:
             with contextlib.suppress(PermissionError):
-                one.signal(signal.SIGKILL)
+                process.signal(signal.SIGKILL)
         with contextlib.suppress(ChildProcessError):
             while os.waitpid(-1, os.WNOHANG)[0]:
                 pass
         if left:
             self._timer = self._loop.call_later(pause, self._sweep, min(2 * pause, SLOWEST / SECOND))
             return
-        print_line(f"zscout: {self._command[0]} is ended: its guardian was killed", sys.stderr)
+        print_line(f"zscout: {self._command[0]} was ended: its guardian was killed", sys.stderr)
         self._over()
 
     # The terminal
@@ -250,21 +252,21 @@ class RunningCommand:
             self._want_terminal()
         elif number == signal.SIGTSTP:
             self._note_suspension()
-            self._say("continue")
+            self._send("continue")
 
     def _want_terminal(self) -> None:
-        """The command was stopped for want of the terminal: it goes on as soon as it can have it."""
+        """The command was stopped because it needs the terminal: continue it as soon as it can have the terminal."""
         if self._gone.done():
             return
         if self._tty.give(self.pid):
-            self._say("continue")
+            self._send("continue")
         else:
-            self._timer = self._loop.call_later(LOOK_AGAIN, self._want_terminal)
+            self._timer = self._loop.call_later(TERMINAL_RETRY_S, self._want_terminal)
 
     def _note_suspension(self) -> None:
         if not self._noted:
             self._noted = True
-            print_line("zscout: not suspended: what it holds would stand idle", sys.stderr)
+            print_line("zscout: not suspended: its devices would be idle", sys.stderr)
 
 
 class _Terminal:
@@ -280,17 +282,17 @@ class _Terminal:
             self.close()
 
     def ours_to_give(self) -> bool:
-        """Whether this process has the foreground alone: others of a pipeline would lose it as well."""
+        """Return True if this process has the foreground, outside a pipeline, whose other processes would lose it."""
         return self._foreground() == os.getpgrp() and sys.stdin.isatty() and sys.stdout.isatty()
 
     def give(self, group: int) -> bool:
-        """Gives a group the foreground, if it is ours. True if the group has it then."""
+        """Give a process group the foreground, if this process has it. Return True if the group has it then."""
         if self._foreground() == os.getpgrp():
             self._set(group)
         return self._foreground() == group
 
     def take_back(self, group: int, *, restore: bool) -> None:
-        """Takes the foreground back from a group; with `restore`, the terminal's modes as they were."""
+        """Take the foreground back from a process group; with `restore`, restore the terminal's modes."""
         if self.fd < 0 or self._foreground() != group:
             return
         self._set(os.getpgrp())
@@ -314,7 +316,7 @@ class _Terminal:
             raise
 
     def _set(self, group: int) -> None:
-        # From the background this would stop us, were the signal not blocked.
+        # From the background tcsetpgrp stops the caller unless SIGTTOU is blocked.
         signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTTOU})
         try:
             os.tcsetpgrp(self.fd, group)

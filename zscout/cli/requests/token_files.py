@@ -1,8 +1,8 @@
-"""Tokens of `zscout acquire`: files and sockets in the user's runtime folder, and the words on these sockets.
+"""Tokens of `zscout acquire`: files and sockets in the user's runtime folder, and the messages on these sockets.
 
-A token is the name of a file, mode 0600, and of the socket beside it, at which the process listens that holds the
-devices. Both lie in `$XDG_RUNTIME_DIR/zscout`, else `/run/user/UID/zscout`, else `/tmp/zscout-UID`: folders that only
-the user can enter. When the hold has ended the file says how, for a day."""
+A token is the name of a file, mode 0600, and of a socket beside it, at which the holder process listens. Both are in
+`$XDG_RUNTIME_DIR/zscout`, else `/run/user/UID/zscout`, else `/tmp/zscout-UID`: folders that only the user can enter.
+When the hold has ended the file has the reason, for a day."""
 
 from __future__ import annotations
 
@@ -23,19 +23,18 @@ import msgspec
 from zscout.config.state_folder import write_durably
 from zscout.types import Ns
 
-MAX_WORD: Final = 60_000
-"""Bytes of one word on a socket."""
-KEPT_FOR: Final = 86_400.0
-"""Seconds for which the file of a hold that has ended is kept."""
-LONGEST_PATH: Final = 100
-"""Characters of a socket's path; the system has 107."""
+MAX_MESSAGE_BYTES: Final = 60_000
+KEEP_ENDED_S: Final = 86_400.0
+"""The file of a hold that has ended is kept for this long."""
+MAX_PATH: Final = 100
+"""Characters of a socket's path; the system allows 107."""
 _TOKEN: Final = re.compile(r"[A-Za-z0-9_.-]{1,64}-[0-9a-f]{12}")
 
 T = TypeVar("T")
 
 
 class TokenFile(msgspec.Struct, frozen=True):
-    """What the file of a token has."""
+    """Content of a token's file, JSON."""
 
     arc: str
     id: str
@@ -44,39 +43,40 @@ class TokenFile(msgspec.Struct, frozen=True):
     rcs: list[str]
     pid: int
     ended: str = ""
-    """Why the hold has ended; empty: it lasts, if the process does."""
+    """The reason that the hold has ended; empty: it lasts as long as the process."""
     code: int = 0
-    """The exit code of `zscout run` since then."""
+    """The exit code of `zscout run` after the end."""
 
 
 class ToHolder(msgspec.Struct, frozen=True):
-    """To the process that holds: `run` (with a descriptor, whose other end is closed once all of the command is gone),
-    `gone`, `renew`, `release`."""
+    """A message to the holder process: `run` (with a descriptor, whose other end is closed when all processes of the
+    command have ended), `gone`, `renew`, `release`."""
 
     op: str
     seconds: float = 0
 
 
 class FromHolder(msgspec.Struct, frozen=True, omit_defaults=True):
-    """From it: `hold` (a command may run), `until`, `notice` (what the hold yields to, in words), `end`, `done`,
-    `refused`."""
+    """A message from the holder process: `hold` (a command may run), `until`, `notice` (something will end the hold, in
+    words), `end`, `done`, `refused`."""
 
     op: str
     env: dict[str, str] = {}
     grace: float = 0
-    """Seconds, at most, from SIGTERM to SIGKILL."""
+    """Most seconds from SIGTERM to SIGKILL."""
     at: Ns = 0
-    """`hold`, `until`: when a command is to be ended unless a later time comes. `end`: when the hold ended."""
+    """`hold`, `until`: the time at which the guardian ends the command, unless a later time comes before. `end`: the
+    time at which the hold ended."""
     why: str = ""
     code: int = 0
     withdrawn: bool = False
-    """`notice`: True if its cause is gone."""
+    """`notice`: True if its cause no longer exists."""
     remaining: float = 0
-    """`done`, of `renew`: seconds for which the hold is protected."""
+    """`done` after `renew`: seconds for which the hold is protected."""
 
 
 class TokenGranted(msgspec.Struct, frozen=True):
-    """From the process that holds to the one that started it."""
+    """From the holder process to the process that started it."""
 
     token: str
     text: str
@@ -84,22 +84,23 @@ class TokenGranted(msgspec.Struct, frozen=True):
 
 
 class TokenChannel:
-    """One connection, or socketpair, of words."""
+    """A connection, or one end of a socketpair, for messages."""
 
     def __init__(self, connection: socket.socket) -> None:
         connection.setblocking(False)
         self._socket = connection
 
     def send(self, word: msgspec.Struct, fds: Sequence[int] = ()) -> None:
-        """A word that can't be sent is dropped: the other process has ended, or has not read for long."""
+        """Send a message with descriptors. A message that can't be sent is dropped: the other process has ended, or has
+        not read for long."""
         with suppress(OSError):
             socket.send_fds(self._socket, [msgspec.json.encode(word)], fds)
 
     async def receive(self, kind: type[T]) -> tuple[T, list[int]] | None:
-        """The next word, and descriptors that came with it. None: the other process has gone, or sent none."""
+        """Return the next message and its descriptors; None: the other process has ended, or sent something else."""
         while True:
             try:
-                data, fds, _, _ = socket.recv_fds(self._socket, MAX_WORD, 1)
+                data, fds, _, _ = socket.recv_fds(self._socket, MAX_MESSAGE_BYTES, 1)
             except BlockingIOError:
                 await readable(self._socket.fileno())
                 continue
@@ -117,7 +118,7 @@ class TokenChannel:
 
 
 async def readable(fd: int) -> None:
-    """Wait until something, or the end, can be read from it."""
+    """Wait until data, or the end, can be read from a descriptor."""
     loop = asyncio.get_running_loop()
     ready = asyncio.Event()
     loop.add_reader(fd, ready.set)
@@ -131,7 +132,7 @@ async def readable(fd: int) -> None:
 
 
 def folders() -> list[Path]:
-    """The folders in which tokens may lie, the first being the one for new ones."""
+    """Return the folders that may have tokens; the first is for new tokens."""
     uid = os.getuid()
     given = os.environ.get("XDG_RUNTIME_DIR")
     tops = [*([Path(given)] if given else []), Path(f"/run/user/{uid}")]
@@ -149,26 +150,26 @@ def _is_ours(folder: Path) -> bool:
 
 
 def new_folder() -> Path:
-    """The folder for new tokens, made if need be, without those that are a day old. Raises OSError."""
+    """Make the folder for new tokens if necessary, and remove tokens that ended a day ago. Raises OSError."""
     for folder in folders():
         with suppress(OSError):
             folder.mkdir(mode=0o700, exist_ok=True)
         if _is_ours(folder):
             _sweep(folder)
             return folder
-    raise PermissionError(f"{folders()[-1]} is not a folder of yours alone; remove it, or set $XDG_RUNTIME_DIR")
+    raise PermissionError(f"other users can write to {folders()[-1]}; remove it, or set $XDG_RUNTIME_DIR")
 
 
 def _sweep(folder: Path) -> None:
     for path in folder.glob("*.json"):
         with suppress(OSError, ValueError, msgspec.DecodeError):
-            old = time.time() - path.stat().st_mtime > KEPT_FOR
+            old = time.time() - path.stat().st_mtime > KEEP_ENDED_S
             if old and (read(path).ended or not _lives(path)):
                 remove(path)
 
 
 def find(token: str) -> Path | None:
-    """The file of a token, or None where there is none of this user on this host."""
+    """Return the file of a token; None if this user has no such token on this host."""
     if _TOKEN.fullmatch(token) is None:
         return None
     paths = (folder / f"{token}.json" for folder in folders() if _is_ours(folder))
@@ -207,8 +208,8 @@ def _socket_of(path: Path) -> Path:
 
 @contextmanager
 def _reachable(path: Path) -> Iterator[str]:
-    """A path of the socket that the system takes, however long its own is."""
-    if len(str(path)) <= LONGEST_PATH:
+    """Yield a path of the socket that is short enough for the system."""
+    if len(str(path)) <= MAX_PATH:
         yield str(path)
         return
     folder = os.open(path.parent, os.O_PATH | os.O_DIRECTORY)
@@ -233,7 +234,7 @@ def listen(path: Path) -> socket.socket:
 
 
 def accept(server: socket.socket) -> TokenChannel | None:
-    """A process of the same user, or None."""
+    """Accept a connection; None unless it is of the same user or root."""
     try:
         connection, _ = server.accept()
     except OSError:
@@ -247,7 +248,7 @@ def accept(server: socket.socket) -> TokenChannel | None:
 
 
 def connect(path: Path) -> TokenChannel | None:
-    """A connection to the process that holds for the token; None: it has ended."""
+    """Connect to the holder process of the token; None: it has ended."""
     connection = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     try:
         with _reachable(_socket_of(path)) as name:

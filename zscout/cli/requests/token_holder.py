@@ -1,9 +1,8 @@
-"""The process behind a token: it waits for the devices, holds them, and has commands run under the hold.
+"""The holder process behind a token: it waits for the devices, holds them, and serves commands that use the hold.
 
-It is started by `zscout acquire` and outlives it, in a session of its own. Each `zscout run` learns how long the hold
-may be relied on; its guardian ends its command by then, whatever happens to this process. The devices are given back
-only when no command is left: a command that can't be ended, and the death of this process, leave it to the devices
-to settle."""
+`zscout acquire` starts it, in a session of its own, and ends before it. Each `zscout run` learns the time until which
+the hold is certain; the guardian of the command ends the command by then, even if this process dies. The devices are
+released only when no command is left. If a command can't be ended, or this process dies, the devices settle."""
 
 from __future__ import annotations
 
@@ -46,14 +45,14 @@ from zscout.types import SECOND, Ns
 
 MAX_RUNS: Final = 64
 """Commands at one time under one token."""
-LOOK_AT_FILE: Final = 1.0
-"""Seconds between two looks whether the token's file is there."""
-KILLED_WITHIN: Final = 2.0
-"""Seconds after the grace in which guardians have killed what they guard."""
+CHECK_FILE_INTERVAL_S: Final = 1.0
+"""Interval between checks that the token's file still exists."""
+KILL_TIMEOUT_S: Final = 2.0
+"""Within this time after the grace guardians have killed their commands."""
 
 
 class TokenEnding(NamedTuple):
-    """How the hold ended: in words, and the exit code of commands that ran, or are run later."""
+    """The end of a hold: the reason in words, and the exit code of commands that ran, or are run later."""
 
     why: str
     code: int = TAKEN_AWAY
@@ -64,7 +63,7 @@ INTERRUPTED: Final = TokenEnding("its holder process was ended")
 
 
 class _Run:
-    """One `zscout run`, and its command."""
+    """A `zscout run` and its command."""
 
     def __init__(self, channel: TokenChannel) -> None:
         self.channel = channel
@@ -72,7 +71,7 @@ class _Run:
 
 
 class TokenHolder:
-    """One hold, and who uses it. `seconds`: for how long at most."""
+    """A hold of at most `seconds`, and the commands that use it."""
 
     def __init__(self, client: Client, held: Held, seconds: float) -> None:
         self._client, self._held, self._arc = client, held, held.arc
@@ -80,7 +79,7 @@ class TokenHolder:
         self._limit: Ns = held.now() + round(seconds * SECOND)
         self._runs: set[_Run] = set()
         self._noticed: dict[str, str] = {}
-        """What the hold yields to, in words."""
+        """Notices in force, in words by code."""
         self._releasing: list[TokenChannel] = []
         self._ending: asyncio.Future[TokenEnding] = asyncio.get_running_loop().create_future()
         self._changed = asyncio.Event()
@@ -90,7 +89,7 @@ class TokenHolder:
             self._direct.watch(self._follow)
 
     async def until_over(self, path: Path, followed: int | None) -> TokenEnding:
-        """Serve the token of this file until the hold is over; `followed` is a process's descriptor."""
+        """Serve the token of this file until the hold is over. followed: pidfd of a process whose end ends the hold."""
         server = token_files.listen(path)
         loop = asyncio.get_running_loop()
         loop.add_reader(server, self._accept, server)
@@ -100,16 +99,16 @@ class TokenHolder:
             async with common.beside(self._watch_hold()):
                 while not self._ending.done():
                     left = self._look(path)
-                    await asyncio.wait((self._ending,), timeout=max(0.0, min(left, LOOK_AT_FILE)))
+                    await asyncio.wait((self._ending,), timeout=max(0.0, min(left, CHECK_FILE_INTERVAL_S)))
                 return self._ending.result()
         finally:
-            # `close` ends the server, when the file says how the hold has ended.
+            # `close` ends the server, after the file has the reason for the end.
             self._server = server
             if followed is not None:
                 loop.remove_reader(followed)
 
     def notice(self, notice: HoldNotice, text: str) -> None:
-        """Let the commands know what the hold yields to, and those that come."""
+        """Pass a notice to the commands that run, and keep it for later commands."""
         self._noticed.pop(notice.code, None)
         if not notice.withdrawn:
             self._noticed[notice.code] = text
@@ -117,8 +116,7 @@ class TokenHolder:
             run.channel.send(FromHolder("notice", why=text, withdrawn=notice.withdrawn))
 
     async def give_back(self, ending: TokenEnding) -> bool:
-        """End the commands, then give the devices back; False where a command can't be ended: they are left to
-        settle."""
+        """End the commands, then release the devices. Return False if a command can't be ended: the devices settle."""
         if not self._ending.done():
             self._ending.set_result(ending)
         at = self._held.now() if self._direct is None else min(self._held.now(), self._direct.ended_at or sys.maxsize)
@@ -139,7 +137,7 @@ class TokenHolder:
         return bool(self._releasing)
 
     def close(self, *, gave_back: bool) -> None:
-        """Answer those that released the token, and serve it no longer."""
+        """Answer the processes that released the token, and stop serving it."""
         if self._server is not None:
             asyncio.get_running_loop().remove_reader(self._server)
             self._server.close()
@@ -161,7 +159,7 @@ class TokenHolder:
             self._end(TokenEnding(ending.reason or ending.outcome))
 
     def _look(self, path: Path) -> float:
-        """Whether its time is over or its file was removed. Returns the seconds that are left."""
+        """End the hold if its time is over or its file was removed. Return the seconds left."""
         left = (self._limit - self._held.now()) / SECOND
         if left <= 0:
             self._end(TokenEnding("its time is over", TIME_OVER))
@@ -217,7 +215,7 @@ class TokenHolder:
             self._changed.set()
 
     async def _note_client(self, run: _Run) -> None:
-        await run.channel.receive(ToHolder)  # `gone`, or it has gone itself
+        await run.channel.receive(ToHolder)  # `gone`, or the process has ended
         run.client_gone.set()
         self._changed.set()
 
@@ -240,12 +238,12 @@ class TokenHolder:
                 run.channel.send(FromHolder("until", at=direct.sure_until))
 
     async def _wait_for_commands(self) -> None:
-        """Until all are gone; a `zscout run` that is frozen is not waited for once its guardian has gone."""
+        """Wait until all commands have ended. A frozen `zscout run` is not waited for once its guardian has ended."""
         now, grace = self._held.now(), DEFAULT_SETTLE
         if self._direct is not None:
             grace = self._direct.gone_by - now if self._direct.over else self._direct.grace
         with suppress(TimeoutError):
-            async with asyncio.timeout(max(0, grace) / SECOND + KILLED_WITHIN):
+            async with asyncio.timeout(max(0, grace) / SECOND + KILL_TIMEOUT_S):
                 while any(not (run.tree_gone.is_set() and run.client_gone.is_set()) for run in self._runs):
                     self._changed.clear()
                     await self._changed.wait()
@@ -293,14 +291,14 @@ async def hold(client: Client, wanted: HoldOptions, seconds: float, follow: int 
                 await client.internals.leave()
                 raise
             if path is not None:
-                _leave_word(path, content, ending, forget=holder.released)
+                _record_end(path, content, ending, forget=holder.released)
             report.event("ended", f"{arc.name} gave back {held_text(held)}", reason=ending.why, code=ending.code)
             holder.close(gave_back=gave_back)
     return 0
 
 
 async def _granted(client: Client, wanted: HoldOptions, report: Report, starter: TokenChannel) -> Held:
-    """The hold, as soon as there is one; nothing is waited for once the starter has gone."""
+    """Wait for the hold, or until the starter has ended. Raises Failed, BadInput, RequestRefused."""
     waiting = asyncio.ensure_future(wait_for_grant(client, wanted, report, None))
 
     async def give_up_without_starter() -> None:
@@ -317,7 +315,7 @@ async def _granted(client: Client, wanted: HoldOptions, report: Report, starter:
         waiting.cancel()
         await asyncio.gather(waiting, return_exceptions=True)
         if gone:
-            raise Failed(f"{wanted.name} is given up: zscout acquire was ended") from None
+            raise Failed(f"{wanted.name} was cancelled: zscout acquire was ended") from None
         raise
     if arc.grant is None:
         ending = ending_of(arc)
@@ -343,12 +341,12 @@ def _new_file(token: str, client: Client, held: Held) -> tuple[Path, TokenFile]:
         path = token_files.new_folder() / f"{token}.json"
         token_files.write(path, content)
     except OSError as error:
-        raise Failed(f"the token can't be kept: {error}") from None
+        raise Failed(f"the token's file can't be written: {error}") from None
     return path, content
 
 
-def _leave_word(path: Path, content: TokenFile, ending: TokenEnding, *, forget: bool) -> None:
-    """Write how the hold ended, for a later use of the token; nothing if it was released, or its file removed."""
+def _record_end(path: Path, content: TokenFile, ending: TokenEnding, *, forget: bool) -> None:
+    """Write the end of the hold to the token's file, or remove the file if the token was released."""
     with suppress(OSError):
         if forget or not path.exists():
             token_files.remove(path)
@@ -358,7 +356,7 @@ def _leave_word(path: Path, content: TokenFile, ending: TokenEnding, *, forget: 
 
 
 def _detach(wanted: HoldOptions) -> None:
-    """Who reads what the starter writes waits for its end, not for ours."""
+    """Close the standard streams: readers of the starter's output must not wait for the end of this process."""
     null = os.open(os.devnull, os.O_RDWR)
     for fd in range(3):
         os.dup2(null, fd)
