@@ -72,4 +72,4 @@ async def test_an_import_that_is_interrupted_says_what_stays(
     task.cancel()
     with pytest.raises(asyncio.CancelledError):
         await task
-    assert capsys.readouterr().err.startswith(f"{CONCURRENT_BOOKINGS} of 20 events imported, which stay booked; ")
+    assert capsys.readouterr().err.startswith(f"{CONCURRENT_BOOKINGS} of 20 events imported; they stay booked; ")

@@ -387,7 +387,7 @@ def test_clocks_that_differ_from_fleet_time_are_named_with_their_direction() -> 
 def test_advisory_roles_are_told_on_a_plain_mesh_only() -> None:
     def opens(fleet: Fleet) -> list[str]:
         told = findings(seen(fleet, certificates=certificates()))
-        return [one.says.partition(" whoever")[0] for one in told if one.about == "open"]
+        return [one.says.partition(" anyone")[0] for one in told if one.about == "open"]
 
     assert opens(PLAIN) == ["a plain mesh:"]
     assert opens(replace(PLAIN, access=ROLES)) == ["a plain mesh: roles are advisory and"]

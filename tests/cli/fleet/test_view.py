@@ -344,7 +344,7 @@ def test_what_can_t_be_opened_or_served_is_one_line_and_code_2(
         for args, words in (
             ([tmp_path / "none.rrd"], "there is no such file"),
             ([tmp_path], "there is no such file"),
-            ([text], "is not a Rerun recording"),
+            ([text], "not a Rerun recording"),
             (["--past", "99d"], '--past: "99d" is not a duration up to 31d'),
             (["--past", "soon"], '--past: "soon" is not a duration up to 31d'),
             ([recording, "--bind", "here"], "is not an IP address"),
