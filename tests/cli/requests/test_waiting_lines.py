@@ -58,7 +58,7 @@ def printed(monkeypatch: pytest.MonkeyPatch, *courses: News, as_json: bool = Fal
         with Report("next", cast("Client", client), as_json=as_json, stream=out) as report:
             async with report.telling(report.follow_wait()):
                 for arc.reason, arc.why, arc.ahead in courses:
-                    arc._told, arc.start = now(), now() + 1200 * SECOND
+                    arc._notified_at, arc.start = now(), now() + 1200 * SECOND
                     report.news(arc)
                     await asyncio.sleep(pause or 0.1)
 

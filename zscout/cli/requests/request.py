@@ -557,7 +557,7 @@ class Report(LiveLine):
         in_way = [rc for rc in met.values() if not rc.sharable or (arc.why and rc.rc in arc.why.rcs)]
         holders = [f"{rc.rc}: {'; '.join(hold_text(hold, arc.priority, me) for hold in rc.holds)}" for rc in in_way]
         holders += [f"{rc.rc}: {rc.lost}" for need in needs if need.rc for rc in need.rcs if rc.lost]
-        words = f"{arc.name} {waits(reason_text(arc.reason, arc.why, (now - arc._told) / SECOND, me), arc.why)}"
+        words = f"{arc.name} {waits(reason_text(arc.reason, arc.why, (now - arc._notified_at) / SECOND, me), arc.why)}"
         ahead = f"{arc.ahead} ahead" if arc.ahead else ""
         waited = self._since(arc)
         since = ", ".join(filter(None, (f"waits since {clock(-waited)} ({span(waited)})", ahead, start)))
