@@ -188,10 +188,7 @@ async def test_a_holder_reports_its_device_broken_and_only_operators_get_it_unti
     assert (well.returncode, well.stdout) == (0, "robot/a: granted again\n"), well.stderr
     await until(lambda: waits.grant is not None)
     none = await lab.zscout("maintain", "robot/a", "--well")
-    assert (none.returncode, none.stderr) == (
-        1,
-        "zscout: no report that robot/a is broken; see zscout booking list\n",
-    )
+    assert (none.returncode, none.stderr) == (1, "zscout: no report that robot/a is broken; see zscout booking list\n")
 
 
 @pytest.mark.slow
