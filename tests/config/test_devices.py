@@ -129,6 +129,10 @@ def test_what_a_table_says_and_what_it_leaves_out() -> None:
     grabber = device(table("framegrabber/f", source='"/dev/video0"'))
     assert isinstance(grabber, FramegrabberRc)
     assert (grabber.by_video, grabber.rate, grabber.quality) == ({"": "/dev/video0"}, 10.0, 80)
+    # An IP camera has the name of any kind.
+    camera = device(table("camera/door", driver="framegrabber", source='"rtsp://door/main"'))
+    assert isinstance(camera, FramegrabberRc)
+    assert (camera.name, camera.by_video) == ("camera/door", {"": "rtsp://door/main"})
     grabber = device(table("framegrabber/f", sources='{ "video/1" = "http://a/1" }', rate="2.5", quality="60"))
     assert isinstance(grabber, FramegrabberRc)
     assert (grabber.by_video, grabber.rate, grabber.quality) == ({"video/1": "http://a/1"}, 2.5, 60)

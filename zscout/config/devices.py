@@ -223,7 +223,7 @@ def read_rc(table: Mapping[str, Any], at: Where) -> RcConfig:
 def _check_rc(rc: BuiltInRc, at: Where) -> None:
     """Checks beyond the types, such as names and duplicate channels. Raises BadInput."""
     check_rc_name(rc.name, at / "name")
-    if isinstance(rc, RadioRc | RobotRc | VideoRc | FramegrabberRc):
+    if isinstance(rc, RadioRc | RobotRc | VideoRc):
         driver = str(rc.__struct_config__.tag)
         kind, _, name = rc.name.partition("/")
         if kind != driver:

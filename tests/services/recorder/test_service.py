@@ -21,6 +21,7 @@ from zscout.messages import (
     HoldView,
     Notice,
     RcmState,
+    RcState,
     RcView,
     ReasonInfo,
     ReasonParty,
@@ -249,6 +250,23 @@ async def test_who_takes_no_pictures_does_not_look(path: Path, tmp_path: Path) -
             token.close()
             await until(lambda: watched == [True, False])
     publisher.close()
+
+
+async def test_a_camera_of_any_kind_is_known_by_its_figures(path: Path) -> None:
+    network, watched = MemoryNetwork(), dict[str, list[bool]]()
+    speaker, keys = (mesh := Leader(network).mesh), mesh.keys
+    for rc in ("camera/door", "psu/bench"):
+        publisher = speaker.frame_publisher(keys.frame(rc))
+        publisher.follow(watched.setdefault(rc, []).append)
+    token = speaker.alive(Token("cart", Role.RC, "camera/door", "i1"))
+    async with recording(path, ears(network), speaker, frames=2):
+        for rc, figure in (("camera/door", "frames_per_second"), ("psu/bench", "volts")):
+            state = RcState(rc, "cart", "i1", sharable=False, figures={figure: 5.0})
+            speaker.put(keys.rc_state(rc), state)
+        await until(lambda: watched["camera/door"] == [True])
+        token.close()
+        await until(lambda: watched["camera/door"] == [True, False])
+    assert watched["psu/bench"] == []
 
 
 async def test_a_part_that_raises_is_logged_and_ends_it(

@@ -55,6 +55,8 @@ DEPTH: Final = 8_192
 ROBOT_DEPTH: Final = 1_024
 """Publications of one kind that may wait here."""
 CAMERAS: Final = "framegrabber/"
+CAMERA_FIGURE: Final = "frames_per_second"
+"""Figure of a camera of another kind."""
 """RCs of this kind have pictures."""
 NO_PICTURE: Final = 3.0
 """Seconds without a picture after which that is shown."""
@@ -175,6 +177,8 @@ class Recorder:
         at = self.now()
         if state.ended:
             self._requests.dropped(at, state.rc, {ended.grant for ended in state.ended})
+        if CAMERA_FIGURE in state.figures and (state.host, Role.RC, state.rc) in self._tokens:
+            self._follow_camera(at, state.rc, alive=True)
         self._robots.state(at, state)
 
     def _on_load(self, key: str, report: messages.LoadReport) -> None:
@@ -199,7 +203,7 @@ class Recorder:
         at = self.now()
         if token.role == Role.CLIENT and not alive:
             self._robots.left(at, Sender(token.host, token.name))
-        if token.role == Role.RC and token.name.startswith(CAMERAS) and self.frames:
+        if token.role == Role.RC and (token.name.startswith(CAMERAS) or not alive):
             self._follow_camera(at, token.name, alive)
         level = "INFO" if alive or token.role == Role.CLIENT else "WARN"
         if token.role == Role.RCM:
@@ -337,7 +341,7 @@ class Recorder:
             self.timeline.regroup(at)
 
     def _follow_camera(self, at: float, camera: str, alive: bool) -> None:
-        if alive and camera not in self._cameras and len(self._cameras) < MAX_CAMERAS:
+        if alive and self.frames and camera not in self._cameras and len(self._cameras) < MAX_CAMERAS:
             self._cameras[camera] = self._supervisor.spawn(self._look(camera))
         elif not alive and camera in self._cameras:
             self._cameras.pop(camera).cancel()

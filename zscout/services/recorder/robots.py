@@ -228,7 +228,7 @@ class RobotTracker:
         if seen is None:
             if len(self._cameras) >= MAX_FOLLOWED:
                 return
-            name = camera.partition("/")[2] or camera
+            name = camera.removeprefix("framegrabber/")
             seen = self._cameras[camera] = _Camera(name, clean_path("camera", name.replace("/", "_")))
         hold = self.holds.get(camera, {}).get(head.grant, NO_HOLD) if head.grant is not None else NO_HOLD
         if hold.robots != seen.hold.robots:
