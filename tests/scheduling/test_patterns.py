@@ -74,6 +74,18 @@ def test_any_free_one_will_do(strategy: StrategyName) -> None:
 
 
 @pytest.mark.parametrize("strategy", ALL)
+def test_the_reason_counts_the_devices_that_are_missing(strategy: StrategyName) -> None:
+    core = core_of(strategy, "fg/a", "fg/b", "fg/c", "fg/d")
+    for name in "bcd":
+        core.handle(0, Requested(request(f"has_{name}", f"fg/{name}")))
+    core.handle(0, Requested(request("three", "fg/*", "fg/*#2", "fg/*#3")))
+    core.handle(0, Requested(request("two", "fg/*", "fg/*#2")))
+    held_ones = "fg/b (held by has_b), c (held by has_c), d (held by has_d)"
+    assert str(core._state.queued["three"].reason) == f"waits for two of {held_ones}"
+    assert str(core._state.queued["two"].reason) == f"waits for one of {held_ones}"
+
+
+@pytest.mark.parametrize("strategy", ALL)
 def test_several_are_counted_by_naming(strategy: StrategyName) -> None:
     core = core_of(strategy, "fg/a", "fg/b", "fg/c")
     core.handle(0, Requested(request("two", "fg/*", "fg/*#2")), Requested(request("also", "fg/*", "fg/*#2")))

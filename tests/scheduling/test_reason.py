@@ -75,6 +75,22 @@ def held(*rcs: tuple[str, Party, str], number: int = 0) -> Reason:
         ),
         (held(("fg/0", TAKE, "fg/*")), "waits for operator (bob@ws2): fg/0 for fg/*", None),
         (
+            held(("fg/0", TAKE, "fg/*"), ("fg/1", SURVEY, "fg/*#2"), ("fg/2", TAKE, "fg/*#2"), number=9),
+            (
+                "waits for two of fg/0 (held by operator (bob@ws2)), 1 (held by survey (alice@ws1)), "
+                "2 (held by operator (bob@ws2)) and 6 more"
+            ),
+            None,
+        ),
+        (
+            held(("a/0", TAKE, "a/*"), ("a/1", TAKE, "a/*"), ("fg/0", TAKE, "fg/*"), ("fg/1", TAKE, "fg/*#2")),
+            (
+                "waits for one of a/0 (held by operator (bob@ws2)), 1 (held by operator (bob@ws2)); "
+                "for two of fg/0 (held by operator (bob@ws2)), 1 (held by operator (bob@ws2))"
+            ),
+            None,
+        ),
+        (
             Reason(ReasonCode.VETOED, ("radio/rf0",), (SURVEY,), "12 of 10", 1),
             "waits for survey (alice@ws1): radio/rf0 refuses more: 12 of 10",
             "waits for survey (alice@ws1), until 14:90 at the latest: radio/rf0 refuses more: 12 of 10",

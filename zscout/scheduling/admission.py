@@ -10,7 +10,7 @@ from typing import Final, Literal, TypeAlias
 from zscout.config.scheduling_policy import RcQuota
 from zscout.scheduling.model import Arc, Rc, absences, union
 from zscout.scheduling.patterns import choices
-from zscout.scheduling.reason import SHOWN, SHOWN_CHOICES, Reason, ReasonCode, of_rcs
+from zscout.scheduling.reason import SHOWN, SHOWN_CHOICES, Reason, ReasonCode, base, of_rcs
 from zscout.scheduling.reservations import Inadmissible, Reservations
 from zscout.scheduling.state import SchedulerState
 from zscout.scheduling.votes import Answer, HolderSet
@@ -93,10 +93,14 @@ class AdmissionCheck:
             if rc.bit & known:  # two patterns may have the same choices
                 continue
             need = bound[rc.name]
+            # Of `fg/*` and `fg/*#2`, which have the same choices, those that are not met.
+            unmet = (bound[rc.name] for rc, _ in self.non_preemptible if rc.name in bound)
+            needs = [other for other in dict.fromkeys(unmet) if base(other) == base(need)]
             for choice in sorted(self.state.matching(need), key=attrgetter("name")):
                 if choice.present and not choice.sharable and not choice.bit & (known | arc.named_mask):
                     known |= choice.bit
-                    held += [(choice, holder, need) for holder in choice.non_preemptible_holders(arc, self.now)[:1]]
+                    holders = choice.non_preemptible_holders(arc, self.now)[:1]
+                    held += [(choice, holder, needs.pop(0) if len(needs) > 1 else needs[0]) for holder in holders]
         first = held[:SHOWN_CHOICES]
         return Reason(
             ReasonCode.HELD,

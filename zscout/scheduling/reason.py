@@ -223,6 +223,14 @@ def short_names(rcs: Iterable[RcName]) -> Iterator[RcName]:
         last = kind
 
 
+def base(pattern: Need) -> Need:
+    """`fg/*` for `fg/*#2`, which asks for a second such device."""
+    return pattern.partition("#")[0]
+
+
+_COUNTS: Final = dict(enumerate(("one", "two", "three", "four", "five", "six", "seven", "eight"), 1))
+
+
 def _held(reason: Reason, until: Until | None) -> str:
     """Holders in the way: of the named RCs, then of each pattern's choices."""
     patterns = reason.patterns or ("",) * len(reason.rcs)
@@ -231,17 +239,18 @@ def _held(reason: Reason, until: Until | None) -> str:
     for party in dict.fromkeys(party for _, party, pattern in held if not pattern):
         rcs = ", ".join(rc for rc, holder, pattern in held if not pattern and holder == party)
         parts.append(f"{party}: {rcs}{_last(party, until)}")
-    for pattern, group in groupby((choice for choice in held if choice[2]), key=lambda choice: choice[2]):
+    for _, group in groupby((choice for choice in held if choice[2]), key=lambda choice: base(choice[2])):
         choices = list(group)
         if len(choices) == 1 and reason.number <= len(held):
-            rc, party, _ = choices[0]
-            parts.append(f"{party}: {rc} for {pattern}{_last(party, until)}")
+            rc, party, need = choices[0]
+            parts.append(f"{party}: {rc} for {need}{_last(party, until)}")
             continue
         names = short_names(rc for rc, _, _ in choices)
         shown = [
             f"{rc} (held by {choice[1]}{_last(choice[1], until)})" for rc, choice in zip(names, choices, strict=True)
         ]
-        parts.append(f"one of {', '.join(shown)}")
+        missing = len({need for _, _, need in choices})
+        parts.append(f"{_COUNTS.get(missing, missing)} of {', '.join(shown)}")
     more = f" and {reason.number - len(held)} more" if reason.number > len(held) else ""
     preferred = f"; by fair shares {reason.detail} goes first" if reason.detail else ""
     return f"waits for {'; for '.join(parts)}{more}{preferred}"
