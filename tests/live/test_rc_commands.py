@@ -227,7 +227,7 @@ async def test_an_rc_that_died_while_the_lead_was_taken_is_lost_within_a_lease(t
             rcm.start(RecoveredState(rcs={"robot/real": real, "robot/ghost": ghost}))
             _, grant = await running(client, "real", "robot/real")
             lost = await client.request("ghost", {"robot/ghost": {}}, min_runtime=600, wait_for_device=True)
-            await until(lambda: lost.reason == "robot/ghost is lost: h is gone")
+            await until(lambda: lost.reason == "robot/ghost is lost: the node of h is gone")
             assert lost.state == "queued"
             assert await answer(client.command("robot/real", grant, ECHO)) == "done"
             assert set(rc.holds.held) == {grant}

@@ -357,7 +357,7 @@ class Lifecycle:
     def _repeat_start(self, record: ComponentRecord) -> None:
         host = record.host
         if host is None or host not in self.state.alive:
-            self.ended(record, host_gone(host or "of its start"))
+            self.ended(record, host_gone(host or "the host of its start"))
         elif record.start_until is not None:
             self.start_answered(record, StartAnswered(record.component, record.incarnation, host, "unknown"))
         else:

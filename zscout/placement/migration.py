@@ -129,7 +129,7 @@ class Migrations:
         if move.source == "ended":
             self._lose(record, move)
         else:
-            self._stay(record, move, f"host {move.to} is gone")
+            self._stay(record, move, f"the node of {move.to} is gone")
 
     def answered(self, record: ComponentRecord, move: Migration, answer: MoveAnswered) -> None:
         if move.stage == "starting":

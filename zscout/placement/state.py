@@ -80,7 +80,7 @@ class Termination:
 
 
 def host_gone(host: HostName | None) -> Termination:
-    return Termination("lost", f"host {host} is gone", with_host=True)
+    return Termination("lost", f"the node of {host} is gone", with_host=True)
 
 
 @dataclass(slots=True)

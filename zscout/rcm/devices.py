@@ -205,7 +205,7 @@ class ExpectedDevices:
             return home.why
         if home is not None and home.seen is None:
             return f"it has not been seen at {host} yet"
-        return f"it is gone from {host}" if host in self._living else f"{host} is gone"
+        return f"it is gone from {host}" if host in self._living else f"the node of {host} is gone"
 
     def view(self, known: RcView, now: Ns, named: HostName | None) -> RcView:
         """An RC as people see it. `known` is what scheduling and the RC itself say of it, and `named` the host of the

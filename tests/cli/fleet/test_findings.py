@@ -309,17 +309,17 @@ def view(rc: str, *, present: bool = True, **more: object) -> RcView:
 
 def test_devices_that_are_not_there_are_told_by_host() -> None:
     fleet = replace(PLAIN, devices={"anvil": ("robot/a", "robot/b"), "forge": ("robot/c",)})
-    gone = view("robot/d", present=False, reason="bellows is gone", gone=60.0, host="bellows")
+    gone = view("robot/d", present=False, reason="the node of bellows is gone", gone=60.0, host="bellows")
     told = mends(seen(fleet, hosts=leading("anvil", "robot/a"), state=led(view("robot/a"), gone)))
     assert [words.partition(";")[0].partition(" since")[0] for _, words in told] == [
         "not there: robot/b of anvil",
-        "not there: robot/d of bellows (bellows is gone",
+        "not there: robot/d of bellows (the node of bellows is gone",
         "not there: robot/c of forge (that host is not seen either)",
     ]
 
 
 def test_what_no_file_names_may_be_forgotten() -> None:
-    gone = led(view("robot/d", present=False, reason="dock is gone", gone=60.0, host="dock"))
+    gone = led(view("robot/d", present=False, reason="the node of dock is gone", gone=60.0, host="dock"))
     assert (
         the_mend(seen(state=gone)).remedy
         == "start zscout-node at dock, or ignore this if it was removed: it is listed for a day"

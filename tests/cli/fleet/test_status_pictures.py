@@ -115,7 +115,8 @@ class Picture:
         view = RcView(name, gone is None, shared, [], at, because, float(gone) if gone else None, twins)
         assert self.state is not None
         self.state.rcs.append(view)
-        self.hosts[at].tokens.add(Token(at, Role.RC, name, "i"))
+        if gone is None:
+            self.hosts[at].tokens.add(Token(at, Role.RC, name, "i"))
         figures: dict[str, float] = {
             figure: float(options[figure]) for figure in ("rate", "frozen_seconds") if figure in options
         }

@@ -25,7 +25,7 @@ def test_one_that_went_is_expected_for_a_day_with_where_it_was() -> None:
     devices.came(token("ws1"))
     devices.went(token("ws1"), 100 * SECOND)
     view = shown(devices, 160 * SECOND)
-    assert (view.host, view.reason, view.gone) == ("ws1", "ws1 is gone", 60.0)
+    assert (view.host, view.reason, view.gone) == ("ws1", "the node of ws1 is gone", 60.0)
     devices.forget_old(100 * SECOND + REMEMBERED)
     assert ARM in devices.names
     devices.forget_old(101 * SECOND + REMEMBERED)
@@ -39,7 +39,7 @@ def test_the_reason_tells_a_host_that_is_gone_from_one_that_has_it_no_more() -> 
     devices.went(token("ws1"), 0)
     assert shown(devices, 0).reason == "it is gone from ws1"
     devices.went(token("ws1", "other", "robot/b"), SECOND)
-    assert shown(devices, SECOND).reason == "ws1 is gone"
+    assert shown(devices, SECOND).reason == "the node of ws1 is gone"
     devices.stopped(ARM, "ws1")
     assert shown(devices, SECOND).reason == "it is stopped at ws1"
     devices.came(token("ws1", "new"))
@@ -99,7 +99,7 @@ def test_what_another_knows_is_taken_where_nothing_better_is_known() -> None:
     # Older news than its own.
     late.went(token("ws1", "back"), now + 30 * SECOND)
     late.remember([SeenHome(ARM, "ws1", 100.0, "long ago")], now + 31 * SECOND)
-    assert (shown(late, now + 31 * SECOND).gone, shown(late, now).reason) == (1.0, "ws1 is gone")
+    assert (shown(late, now + 31 * SECOND).gone, shown(late, now).reason) == (1.0, "the node of ws1 is gone")
 
 
 def test_a_list_of_devices_has_all_homes_of_each() -> None:
@@ -123,4 +123,4 @@ def test_who_follows_no_tokens_any_more_knows_of_nobody_that_it_lives() -> None:
     devices = ExpectedDevices({})
     devices.came(token("ws1"))
     devices.lost_sight(10 * SECOND)
-    assert (shown(devices, 12 * SECOND).gone, shown(devices, 12 * SECOND).reason) == (2.0, "ws1 is gone")
+    assert (shown(devices, 12 * SECOND).gone, shown(devices, 12 * SECOND).reason) == (2.0, "the node of ws1 is gone")

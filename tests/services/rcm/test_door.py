@@ -155,7 +155,12 @@ async def test_a_device_that_went_is_waited_for() -> None:
     fleet.network.kill(rc.mesh)
     await asyncio.sleep(2)
     notice = await client.ask("patient", "robot/arm1", check=True)
-    assert (notice.state, notice.reason) == ("queued", "robot/arm1 is lost: devices is gone")
+    assert (notice.state, notice.reason) == ("queued", "robot/arm1 is lost: the node of devices is gone")
     (view,) = (await fleet.state()).rcs
-    assert (view.rc, view.present, view.host, view.reason) == ("robot/arm1", False, "devices", "devices is gone")
+    assert (view.rc, view.present, view.host, view.reason) == (
+        "robot/arm1",
+        False,
+        "devices",
+        "the node of devices is gone",
+    )
     assert view.gone == pytest.approx(2, abs=0.1)

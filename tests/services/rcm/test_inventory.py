@@ -35,7 +35,7 @@ async def test_the_next_leader_knows_what_went_while_another_led() -> None:
         fleet.network.kill(dies.mesh)
         await until(lambda leads=leads: leads.rcm)  # type: ignore[misc]
         view = await sees(fleet.watcher, RC, present=False)
-        assert (view.host, view.reason) == ("devices", "devices is gone")
+        assert (view.host, view.reason) == ("devices", "the node of devices is gone")
         assert view.gone is not None
         assert 60 < view.gone < 80
 
@@ -52,7 +52,7 @@ async def test_it_is_kept_over_a_restart_of_the_only_candidate(tmp_path: Path) -
     anew = fleet.candidate("x", tmp_path)
     await until(lambda: anew.rcm)
     view = await sees(fleet.watcher, RC, present=False)
-    assert (view.host, view.reason) == ("devices", "devices is gone")
+    assert (view.host, view.reason) == ("devices", "the node of devices is gone")
 
 
 async def test_a_file_that_is_none_is_replaced(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

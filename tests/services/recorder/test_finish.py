@@ -160,7 +160,7 @@ def test_who_is_waited_for_comes_first_and_who_is_absent_last(path: Path) -> Non
         for rc in ("robot/a", "robot/b", "robot/c", "robot/d"):
             timeline.holders(0, rc, [HolderRow("survey")])
         timeline.contended(1, ["robot/c"])
-        timeline.holders(2, "robot/a", [], "ws1 is gone")
+        timeline.holders(2, "robot/a", [], "the node of ws1 is gone")
         timeline.contended(2, ["robot/a"])
         layout = timeline.layout(live=False)
         assert (list(layout.contended), list(layout.absent)) == (["/devices/robot/c"], ["/devices/robot/a"])
@@ -171,8 +171,8 @@ def test_who_is_waited_for_comes_first_and_who_is_absent_last(path: Path) -> Non
         assert list(timeline.layout(live=True).contended) == []
         timeline.holders(1001, "robot/a", [])
         assert list(timeline.layout(live=False).absent) == []
-    assert lanes(path, "/devices/robot/a")["/devices/robot/a"][1:] == [(2, ["ws1 is gone"]), (1001, [""])]
-    assert colours(path, "/devices/robot/a")["/devices/robot/a"]["ws1 is gone"] == ABSENT
+    assert lanes(path, "/devices/robot/a")["/devices/robot/a"][1:] == [(2, ["the node of ws1 is gone"]), (1001, [""])]
+    assert colours(path, "/devices/robot/a")["/devices/robot/a"]["the node of ws1 is gone"] == ABSENT
 
 
 def test_an_operator_is_red_among_arcs_and_events_as_well(path: Path) -> None:

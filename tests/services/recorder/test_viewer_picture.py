@@ -214,7 +214,7 @@ def test_the_paper_s_example_in_the_viewer(path: Path, tmp_path: Path) -> None:
 def test_what_several_want_stands_above_and_what_is_not_there_below(tmp_path: Path) -> None:
     with Timeline("lab", path=tmp_path / "run.rrd") as timeline:
         # By their names they would stand the other way round.
-        timeline.holders(0, "robot/a", [], "ws1 is gone")
+        timeline.holders(0, "robot/a", [], "the node of ws1 is gone")
         timeline.holders(0, "robot/b", [HolderRow("survey")])
         timeline.holders(0, "robot/c", [HolderRow("drive", operator=True)])
         for number in range(ONE_PANE):

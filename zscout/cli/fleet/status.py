@@ -27,6 +27,8 @@ from zscout.types import SECOND, VERSION, Ns
 
 MAX_NAMED: Final = 8
 """Components in the row of a host, and hosts of one version."""
+NODE_ROLES: Final = (Role.NODE, Role.CANDIDATE, Role.RCM, Role.RC, Role.LOAD, Role.RECORDER)
+"""Roles of a node, not of programs on its host."""
 MAX_FIGURES_SHOWN: Final = 12
 
 
@@ -212,6 +214,9 @@ class Standing:
             return f"gone since {clock(-gone)} ({span(gone)})", "red"
         if not host.tokens:
             return "not there", "red"
+        if not any(map(host.has, NODE_ROLES)):
+            # A host of programs alone has none.
+            return "no node", "red" if name in self._homes().values() else ""
         if self.fleet_view.stale(host):
             return "no load report", "yellow"
         words, style = ("leads", "bold") if host.has(Role.RCM) else ("alive", "")
