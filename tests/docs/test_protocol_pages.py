@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from tests.protocol_pages import ENTRY, PARTS
+from tests.test_house import WORN
 
 WRITTEN = [path for path in [ENTRY, *PARTS] if path.stem != "messages"]
 """All but the generated page."""
@@ -35,6 +36,14 @@ def test_a_page_can_be_read_in_some_minutes(page: Path) -> None:
     for heading, paragraphs in sections(page):
         assert sum(map(words, paragraphs)) <= 150, heading
         assert all(words(paragraph) <= 80 for paragraph in paragraphs), heading
+
+
+@pytest.mark.parametrize("page", [ENTRY, *PARTS], ids=lambda page: page.stem)
+def test_a_page_is_in_plain_english(page: Path) -> None:
+    prose = re.sub(r"```.*?```|`[^`\n]*`", "", page.read_text(), flags=re.DOTALL)
+    for phrase, limit in WORN.items():
+        found = re.findall(phrase, prose)
+        assert len(found) <= max(1, limit * words(prose) / 1_000), found
 
 
 def test_the_entry_links_every_page() -> None:
