@@ -162,7 +162,7 @@ def test_the_shipped_buildings_are_listed(capsys: pytest.CaptureFixture[str]) ->
 
 
 def test_the_building_in_the_docs_is_one(tmp_path: Path) -> None:
-    text = (Path(__file__).parents[3] / "docs" / "simulation.md").read_text()
+    text = (Path(__file__).parents[3] / "docs" / "reference" / "building.md").read_text()
     file = tmp_path / "study.toml"
     file.write_text(text.partition("```toml\n")[2].partition("```")[0])
     assert plan_named(str(file)).robots[0].id == 33
