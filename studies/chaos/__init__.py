@@ -1,1 +1,1 @@
-"""Faults in a real fleet of network namespaces, and the promises as they are seen from outside."""
+"""Faults in a real fleet of network namespaces, and checks of the promises from outside."""

@@ -21,13 +21,13 @@ from studies.chaos.work import HOSTS, now
 
 def main(words: list[str] | None = None) -> int:
     options = argparse.ArgumentParser(prog="python -m studies chaos", description=__doc__)
-    options.add_argument("--minutes", type=float, default=20.0, help="how long there are faults (20)")
-    options.add_argument("--count", type=int, help="so many faults, however long that takes")
-    options.add_argument("--seed", type=int, default=1, help="which faults, and what is asked for (1)")
-    options.add_argument("--only", default="", metavar="KIND,...", help=f"of these kinds only: {', '.join(KINDS)}")
-    options.add_argument("--json", action="store_true", help="the report as JSON; so it is in a pipe, too")
-    options.add_argument("--traces", type=Path, metavar="FILE", help="keep what became of holds, in the order of time")
-    options.add_argument("--logs", type=Path, metavar="FOLDER", help="keep all logs there")
+    options.add_argument("--minutes", type=float, default=20.0, help="minutes with faults (20)")
+    options.add_argument("--count", type=int, help="number of faults, however long that takes")
+    options.add_argument("--seed", type=int, default=1, help="selects faults and requests (1)")
+    options.add_argument("--only", default="", metavar="KIND,...", help=f"only these kinds: {', '.join(KINDS)}")
+    options.add_argument("--json", action="store_true", help="print the report as JSON; always so in a pipe")
+    options.add_argument("--traces", type=Path, metavar="FILE", help="write the events of holds, in order of time")
+    options.add_argument("--logs", type=Path, metavar="FOLDER", help="keep all logs in this folder")
     asked = options.parse_args(words)
     kinds = [kind.strip() for kind in asked.only.split(",") if kind.strip()] or list(KINDS)
     if unknown := [kind for kind in kinds if kind not in KINDS]:
@@ -60,7 +60,7 @@ def main(words: list[str] | None = None) -> int:
     else:
         print(report.table(found["figures"]))
         print(f"longest of ours: {'; '.join(found['late'])}")
-        print(f"\n{found['faults']} faults in {found['seconds']:.0f} s, seed {asked.seed}; told: {found['told']}")
+        print(f"\n{found['faults']} faults in {found['seconds']:.0f} s, seed {asked.seed}; events: {found['told']}")
         print(f"{len(found['violations'])} violations" + (f"; logs are in {folder}" if keep else ""))
         for line in found["violations"][:50]:
             print(line)
@@ -68,14 +68,14 @@ def main(words: list[str] | None = None) -> int:
 
 
 def run(asked: Any, kinds: list[str], folder: Path) -> dict[str, Any]:
-    rng = random.Random(f"chaos {asked.seed}")  # noqa: S311 - what failed once is to come again
+    rng = random.Random(f"chaos {asked.seed}")  # noqa: S311 - failures must be repeatable
     start, until = now(), time.monotonic() + asked.minutes * 60
     with Fleet(folder, str(asked.seed)) as fleet:
         print(f"chaos: {len(HOSTS)} hosts, logs in {folder}", file=sys.stderr)
         limit = lambda number: number >= asked.count if asked.count else time.monotonic() > until  # noqa: E731
         faults = random_faults(fleet, rng, kinds, limit)
         try:
-            violations, told = finish(fleet, faults)
+            violations, counts = finish(fleet, faults)
         finally:
             if asked.traces is not None:
                 write_traces(folder, asked.traces)
@@ -85,19 +85,22 @@ def run(asked: Any, kinds: list[str], folder: Path) -> dict[str, Any]:
         "faults": len(faults),
         "figures": report.figures(faults),
         "late": report.late(faults, start),
-        "told": {name: told[name] for name in ("asked", "entered", "commanded", "command", "publish", "lost")},
-        "violations": [report.around(one, faults, start) for one in violations],
+        "told": {name: counts[name] for name in ("asked", "entered", "commanded", "command", "publish", "lost")},
+        "violations": [report.around(violation, faults, start) for violation in violations],
         "logs": str(folder),
     }
 
 
 def write_traces(folder: Path, file: Path) -> None:
-    """The lines of `zscout.trace` of all programs, in the order of time: one behaviour, for `formal.traces`."""
+    """Write the `zscout.trace` lines of all programs in order of time: one behaviour for `formal.traces`."""
     import json
 
     traced = [
-        one for host in HOSTS for one in events(folder / f"{host}.log") if "instance" in one or "instances" in one
+        event
+        for host in HOSTS
+        for event in events(folder / f"{host}.log")
+        if "instance" in event or "instances" in event
     ]
     with file.open("w") as out:
-        for event in sorted(traced, key=lambda one: one["at"]):
+        for event in sorted(traced, key=lambda event: event["at"]):
             out.write(json.dumps(event) + "\n")

@@ -1,5 +1,5 @@
-"""Whether a run kept the promises of docs/promises.md, as far as they can be seen from outside: from what its programs
-told, in the order of time. Numbers in brackets are those of that page."""
+"""Checks a run against the promises of docs/promises.md, as far as they are visible from outside: from the events that
+its programs logged, in order of time. Promises are numbered as on that page."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ SECOND: Final = 1_000_000_000
 HOLD_LEASE: Final = 3 * SECOND
 BELIEF: Final = HOLD_LEASE + 2 * SECOND
 AFTER: Final = 10 * SECOND
-"""For so long after it was mended a fault may still show, where nobody waited until all were served."""
+"""A fault may have effects for this time after its end, if the run did not wait until all clients were served."""
 CALM: Final = 3 * SECOND
 JUST_OVER: Final = SECOND // 5
-"""A leader that was away may lose its first link as others come back, in 0.1 s; a client hears of that later."""
+"""A leader that was away may lose its first link while others come back, within 0.1 s; clients notice that later."""
 TERMS, TERMS_WITHIN = 4, 10 * SECOND
 KEPT: Final = 4096
 
@@ -32,7 +32,7 @@ Grant: TypeAlias = tuple[Term, int]
 
 @dataclass(frozen=True, slots=True)
 class Apart:
-    """Two hosts that lived and had no link that stands."""
+    """Two running hosts without a working link."""
 
     pair: frozenset[str]
     since: int
@@ -60,16 +60,16 @@ class _Open:
     worse_since: int | None = None
     granted: bool = False
     held: tuple[Grant, int] | None = None
-    """Its last hold, and when it began: a new leader may give back what is still held."""
+    """Its last hold and its beginning: a new leader may return a hold that is still in force."""
     outcome: str | None = None
     believed: tuple[Grant, int, list[str]] | None = None
-    """The hold that its client believes in, since when, and the RCs of it."""
+    """The hold that its client believes in, since when, and its RCs."""
     entered: Grant | None = None
-    """The last one that all of its RCs have confirmed to its client."""
+    """The last grant that all its RCs have confirmed to the client."""
 
 
 class Checker:
-    """Takes what happened, one event after the other, and then `finish`."""
+    """Call `take` for each event, and then `finish`."""
 
     def __init__(self, faults: Sequence[Fault] = (), apart: Sequence[Apart] = ()) -> None:
         self.faults, self.apart = faults, apart
@@ -77,7 +77,7 @@ class Checker:
         self._instances: defaultdict[tuple[str, str], _Instance] = defaultdict(_Instance)
         self._obeyed: dict[str, Grant] = {}
         self._done: defaultdict[str, list[tuple[int, Grant]]] = defaultdict(list)
-        """By exclusive RC: when commands were answered, and the newest grant until then."""
+        """By exclusive RC: times of answered commands, with the newest grant until then."""
         self._began: dict[tuple[str, Grant], int] = {}
         self._over: dict[tuple[str, Grant], int] = {}
         self._owner: dict[Grant, str] = {}
@@ -87,7 +87,7 @@ class Checker:
         self._too_much: set[tuple[str, frozenset[Grant]]] = set()
         self._terms: dict[Term, int] = {}
         self._led: dict[str, int] = {}
-        """When each node published last."""
+        """The time of each node's last publication."""
         self._recent: deque[int] = deque()
         self.counts: defaultdict[str, int] = defaultdict(int)
 
@@ -95,7 +95,7 @@ class Checker:
         self.found.append(Violation(at, promise, text))
 
     def touched(self, hosts: Iterable[str], at: int, since: int = 0) -> bool:
-        """Whether a fault may have been felt at one of these hosts, from `since` before `at` on."""
+        """Return True if a fault may have affected one of these hosts between `at - since` and `at`."""
         named = set(hosts)
         return any(
             fault.began <= at and at - since <= fault.over(AFTER) and named & set(fault.touched)
@@ -103,18 +103,19 @@ class Checker:
         )
 
     def unlinked(self, hosts: Iterable[str], at: int) -> bool:
-        """Whether one of these hosts and one that led had no link for longer than the lease, until lately."""
+        """Return True if one of these hosts had no link to a leader's host for longer than the lease, until CALM ago or
+        later."""
         return any(
-            one.until - one.since > LEASE * SECOND
-            and one.since <= at <= one.until + CALM
-            and any(one.pair == {host, node} and led >= one.since for host in hosts for node, led in self._led.items())
-            for one in self.apart
+            gap.until - gap.since > LEASE * SECOND
+            and gap.since <= at <= gap.until + CALM
+            and any(gap.pair == {host, node} and led >= gap.since for host in hosts for node, led in self._led.items())
+            for gap in self.apart
         )
 
     def excused(self, hosts: Iterable[str], at: int) -> bool:
-        """Whether what was lost by one of these hosts may be a fault's doing, or that of a leader that is just back."""
+        """Return True if a fault, or a leader that is just back, may have caused a loss at one of these hosts."""
         back = [fault for fault in self.faults if fault.mended and 0 <= at - fault.mended <= JUST_OVER]
-        led = any(self._led.get(one, 0) >= fault.began - LEASE * SECOND for fault in back for one in fault.touched)
+        led = any(self._led.get(host, 0) >= fault.began - LEASE * SECOND for fault in back for host in fault.touched)
         return led or self.touched(hosts, at) or self.unlinked(hosts, at)
 
     def take(self, host: str, event: Json) -> None:
@@ -125,7 +126,7 @@ class Checker:
         elif handler is not None:
             handler(host, event)
 
-    # What RCs tell
+    # Events of RCs
 
     def _rc(self, event: Json) -> None:
         rc, at, instance = event["rc"], event["at"], self._instances[event["rc"], event["instance"]]
@@ -138,9 +139,9 @@ class Checker:
             if grant in instance.ended:
                 self.broken(at, "6 no second beginning", f"{rc} begins {grant} again")
             owner = self._owner.get(grant, "")
-            # A leader that was cut off may grant once more as its links come back, before it hears the one that knows.
+            # As its links return, a leader that was cut off may grant again before it knows the present leader.
             if at - self._given_up.get(owner, at) > CALM and not self.touched(HOSTS, at, CALM):
-                self.broken(at, "15 nothing for who gave up", f"{rc} begins {grant} for {owner}")
+                self.broken(at, "15 nothing after giving up", f"{rc} begins {grant} for {owner}")
             self._began.setdefault((rc, grant), at)
         for grant in instance.holds - holds:
             self._over[rc, grant] = at
@@ -176,14 +177,14 @@ class Checker:
             del self._open[key]
 
     def on_mended(self, host: str, event: Json) -> None:
-        """An RC's host was alone for longer than the hold lease."""
+        """An RC's host was cut off or frozen until now: its holds must have ended after the hold lease."""
         for (rc, _), instance in self._instances.items():
             if host_of(rc) == host:
                 for grant in instance.holds:
                     if event["at"] - max(event["since"], self._began.get((rc, grant), 0)) > HOLD_LEASE + SECOND // 2:
-                        self.broken(event["at"], "7 silence ends holds", f"{rc} holds {grant} and heard nobody")
+                        self.broken(event["at"], "7 silence ends holds", f"{rc} holds {grant} without a leader")
 
-    # What leaders tell
+    # Events of leaders
 
     def on_publish(self, host: str, event: Json) -> None:
         term = _term(event["term"])
@@ -202,16 +203,16 @@ class Checker:
             for fault in self.faults
         )
         if len(self._recent) > TERMS + causes:
-            self.broken(at, "13 terms", f"{len(self._recent)} terms began within 10 s, and {causes} faults were there")
+            self.broken(at, "13 terms", f"{len(self._recent)} terms began within 10 s, with {causes} faults")
 
-    # What clients tell
+    # Events of clients
 
     def on_asked(self, host: str, event: Json) -> None:
         self._open[host, event["id"]] = _Open(event)
         self._needs[f"{host}/{CLIENT}/{event['id']}"] = event["needs"]
 
     def on_anew(self, host: str, event: Json) -> None:
-        """What had its time unheard is asked for under a new id."""
+        """The client did not learn of its hold until its time was over, and requests it again under a new id."""
         request = self._open.pop((host, event["id"]), None)
         if request is not None:
             self._open[host, event["new"]] = request
@@ -252,18 +253,18 @@ class Checker:
             request.worse_since = None
 
     def on_lost(self, host: str, event: Json) -> None:
-        """A hold or wait is over, or not, by another's word or the client's own."""
+        """A hold or wait may be over: by a notice, or by the client's own judgement."""
         request, at = self._open.get((host, event["id"])), event["at"]
         if request is None:
             return
         outcome, held = event.get("outcome"), request.believed
         if outcome == "client_lost" and not self.excused([host], at):
-            self.broken(at, "10 nobody alive is dropped", f"{host} {event['id']}: {event['reason']}")
+            self.broken(at, "10 living clients are kept", f"{host} {event['id']}: {event['reason']}")
         elif held is not None and (outcome == "lost" or event["do"] == "lost"):
             where = {host, *map(host_of, held[2])}
             if held[0] == request.entered and not self.excused(where, at):
                 text = f"{host} {event['id']} lost {held[0]} of {', '.join(held[2])}: {event['reason']}"
-                self.broken(at, "10 what no fault touches goes on", text)
+                self.broken(at, "10 untouched holds continue", text)
         self._disbelieve(host, at, request)
 
     def on_ended(self, host: str, event: Json) -> None:
@@ -281,7 +282,7 @@ class Checker:
             return
         self._given_up[f"{host}/{CLIENT}/{event['id']}"] = event["at"]
         self._disbelieve(host, event["at"], request)
-        # One that may be kept, and had its time, ends with an RC.
+        # A hold that may be kept, and had its time, ends when an RC is lost.
         kept = (
             request.outcome == "lost"
             and request.held is not None
@@ -292,7 +293,7 @@ class Checker:
             self.broken(event["at"], "9 nothing is thrown away", text)
 
     def _disbelieve(self, host: str, at: int, request: _Open) -> None:
-        """A client's belief in a hold is over: had all its RCs held it?"""
+        """A client stops believing in a hold: check that all its RCs held it."""
         if request.believed is None:
             return
         grant, since, rcs = request.believed
@@ -310,20 +311,20 @@ class Checker:
                 self.broken(at, "8 no half gang", text)
 
     def on_commanded(self, host: str, event: Json) -> None:
-        """What was obeyed, by who sent it: an older grant's command that was sent after a newer's was answered."""
+        """A command was answered: no command of an older grant may be obeyed after an answer under a newer grant."""
         rc = event["rc"]
         if event["code"] or rc in CAPACITY:
             return
         grant, done = _grant(event["grant"]), self._done[rc]
         before = bisect.bisect_left(done, (event["sent"],)) - 1
         if before >= 0 and done[before][1] > grant:
-            text = f"{rc} obeyed {host} under {grant}, after one under {done[before][1]}"
+            text = f"{rc} obeyed {host} under {grant}, after a command under {done[before][1]}"
             self.broken(event["at"], "2 no older command", text)
         done.append((event["at"], max(grant, done[-1][1] if done else grant)))
         del done[:-KEPT]
 
     def finish(self, at: int) -> None:
-        """All is over: nothing is open, nothing is held."""
+        """Check the end of the run: no request is open, no RC is held."""
         for (host, request), state in sorted(self._open.items()):
             since = (at - state.asked["at"]) / SECOND
             text = f"{host} {request} ({', '.join(state.asked['needs'])}) asked {since:.1f} s ago"
@@ -343,11 +344,11 @@ def _grant(value: Sequence[Any]) -> Grant:
 
 
 def events(file: Path) -> Iterator[Json]:
-    """What a program told, and its errors."""
+    """The events that a program logged, and its errors."""
     at = 0
     with file.open(errors="replace") as lines:
         for line in lines:
-            # The last one: who is killed as it writes leaves the beginning of another.
+            # The last event of a line: a program that was killed while writing leaves the beginning of another.
             if (start := line.rfind('{"at":')) >= 0 and line.endswith("}\n"):
                 event: Json = json.loads(line[start:])
                 at = max(at, event["at"])
@@ -359,11 +360,11 @@ def events(file: Path) -> Iterator[Json]:
 def check(
     folder: Path, faults: Sequence[Fault], marks: Iterable[tuple[str, Json]], end: int, apart: Sequence[Apart] = ()
 ) -> Checker:
-    """Holds a whole run against the promises: the logs in `folder`, and what the run itself did to its hosts."""
+    """Check a whole run: the logs in `folder`, and the faults and marks of the run."""
     checker = Checker(faults, apart)
     streams = [[(event["at"], host, event) for host, event in marks]]
-    told = [_of(host, folder / f"{host}.log") for host in HOSTS if (folder / f"{host}.log").exists()]
-    for at, host, event in heapq.merge(*streams, *told, key=lambda one: one[0]):
+    logs = [_of(host, folder / f"{host}.log") for host in HOSTS if (folder / f"{host}.log").exists()]
+    for at, host, event in heapq.merge(*streams, *logs, key=lambda item: item[0]):
         if event["do"] == "error":
             checker.broken(at, "17 no error unseen", f"{host}: {event['text']}")
         elif event["do"] == "imported" and event["modules"]:
@@ -375,7 +376,7 @@ def check(
 
 
 def _of(host: str, file: Path) -> Iterator[tuple[int, str, Json]]:
-    """In the order of time: threads may overtake each other by a little."""
+    """A log's events in order of time. In the file, events of different threads may be slightly out of order."""
     window: list[tuple[int, int, Json]] = []
     for number, event in enumerate(events(file)):
         heapq.heappush(window, (event["at"], number, event))

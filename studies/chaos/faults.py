@@ -1,4 +1,4 @@
-"""Faults: what is done to which hosts, for how long. Drawn from a seed."""
+"""Faults, drawn from a seed: their kind, hosts and duration."""
 
 from __future__ import annotations
 
@@ -16,38 +16,38 @@ Way = tuple[str, str]
 
 @dataclass(slots=True)
 class Fault:
-    """Times in ns, 0 where it did not come to that."""
+    """Times in ns; 0 if it has not happened."""
 
     kind: str
     how: str
     """kill, freeze, cut, cable or address."""
     lasts: float
     hosts: tuple[str, ...] = ()
-    """That are killed, frozen, unplugged or without an address."""
+    """The hosts that are killed, frozen, unplugged or without an address."""
     ways: frozenset[Way] = frozenset()
     began: int = 0
     at: int = 0
-    """It was done: it began a little before."""
+    """When it was complete, a little after `began`."""
     mended: int = 0
     alone: bool = True
-    """Everything was served before it, and no other fault came beside it until all was again."""
+    """True if all clients were served before it, and no other fault came until all were served again."""
     term: int = 0
-    """The leader's counter before it."""
+    """The counter of the term before it."""
     granted: int = 0
-    """The first grant to somebody who asked after it began."""
+    """The first grant of a request that was made after it."""
     linked: int = 0
-    """The last link or token stood again."""
+    """When the last link or token was back."""
     served: int = 0
 
     @property
     def touched(self) -> tuple[str, ...]:
-        """Whom it strikes itself: of a host that is cut from all others, these are not."""
+        """The hosts that it affects. If a host is cut off, the others do not count."""
         if not self.ways:
             return self.hosts
         return self.hosts or tuple(sorted({host for way in self.ways for host in way}))
 
     def over(self, after: int) -> int:
-        """When it can't be felt any more: all was served, or so much later."""
+        """When it has no effect any more: all clients were served, or `after` ns have passed."""
         if not self.mended:
             return 1 << 62
         return self.served if self.served and after else self.mended + after
@@ -58,7 +58,7 @@ def isolated(host: str) -> frozenset[Way]:
 
 
 def groups(rng: random.Random) -> frozenset[Way]:
-    """Two or three parts of the fleet that do not hear one another."""
+    """Two or three parts of the fleet without links between them."""
     parts = {host: rng.randrange(rng.choice((2, 2, 3))) for host in HOSTS}
     return frozenset((a, b) for a in HOSTS for b in HOSTS if parts[a] != parts[b])
 
@@ -103,9 +103,9 @@ def _one_way(rng: random.Random) -> frozenset[Way]:
 
 
 def _two_frozen(rng: random.Random, _leader: str) -> Fault:
-    """Neither closes their link: each finds it as it was."""
-    one = rng.choice(NODES)
-    return Fault("", "freeze", rng.uniform(1.0, 3.5), (one, rng.choice([host for host in HOSTS if host != one])))
+    """Both hosts of a link are frozen: neither closes it, and each finds it as before."""
+    first = rng.choice(NODES)
+    return Fault("", "freeze", rng.uniform(1.0, 3.5), (first, rng.choice([host for host in HOSTS if host != first])))
 
 
 def _blackout(rng: random.Random, _leader: str) -> Fault:
@@ -129,13 +129,13 @@ KINDS: Final[dict[str, tuple[int, Callable[[random.Random, str], Fault]]]] = {
     "blackout": (1, _blackout),
     "client killed": (1, _any("kill", *CLIENTS)),
 }
-"""Of each kind its share, and how one is made from a random source and the host that leads. Only zscout's own programs
-follow their host to another address: the page of the protocol asks nobody else to. That kind comes by `--only`: after
-it, programs that know the page alone lose links for long (docs/roadmap.md)."""
+"""The share of each kind, and its function, which draws a fault from a random source and the leader's host.
+`readdressed` comes only with `--only`: the protocol does not require programs to follow their host to another address,
+so the foreign programs lose links for long after it (docs/roadmap.md)."""
 
 
 def draw(rng: random.Random, kinds: list[str], leader: str) -> Fault:
-    kind = kinds[0] if len(kinds) == 1 else rng.choices(kinds, [KINDS[one][0] for one in kinds])[0]
+    kind = kinds[0] if len(kinds) == 1 else rng.choices(kinds, [KINDS[kind][0] for kind in kinds])[0]
     fault = KINDS[kind][1](rng, leader)
     fault.kind = kind
     return fault

@@ -61,7 +61,7 @@ class Refused(Exception):
 
 
 class Peer:
-    """What clients and RCs have in common: a session, whom they obey, and standstills of their own."""
+    """The common part of clients and RCs: a session, the leaders, and stalls of this process."""
 
     def __init__(self, join: Callable[[], zenoh.Session], program: str, fleet: str, host: str, seed: str) -> None:
         self.session, self.host, self.base = join(), host, f"zscout/{fleet}"
@@ -69,9 +69,9 @@ class Peer:
         self._makes: list[Callable[[zenoh.Session], Any]] = []
         self.tokens: set[str] = set()
         self._sessions: dict[str, tuple[str, bool]] = {}
-        """Every session that has shown itself, and whether its token lives."""
+        """By known session: its program, and True while its token lives."""
         self._suspected: dict[str, tuple[int, int]] = {}
-        """When each contradiction was seen first and last."""
+        """The first and last time of each contradiction."""
         self._joined, self._pause = 0, REJOIN
         self.rng = random.Random(seed)  # noqa: S311
         self.lock = threading.RLock()
@@ -79,7 +79,7 @@ class Peer:
         self.leaders: set[str] = set()
         self._ticked = now()
         self._stall = (0, 0)
-        """Its end and its length."""
+        """End and length of the last stall."""
         self.declared: list[Any] = []
         self.declare(lambda session: self.show(session, "session", program, str(session.info.zid())))
 
@@ -90,7 +90,7 @@ class Peer:
         self.declared.append(make(self.session))
 
     def suspect(self, what: str, *, so: bool = True) -> None:
-        """`so`: what is seen contradicts itself. If that lasts the mesh is joined anew."""
+        """Note the contradiction `what` while `so`. If it persists, reopen the session."""
         with self.lock:
             at = now()
             first, last = self._suspected.get(what, (at, at))
@@ -114,15 +114,15 @@ class Peer:
             self.session = session
             self.declared, old = [make(session) for make in self._makes], self.declared
         threading.Event().wait(0.5)
-        with contextlib.suppress(zenoh.ZError):  # one with links to nowhere takes too long
+        with contextlib.suppress(zenoh.ZError):  # with dead links, closing takes too long
             before.close()  # type: ignore[no-untyped-call]
         old.clear()
 
     def look(self) -> None:
-        """Now and then."""
+        """Check the tokens of all peers; call this about once a second."""
         with self.lock:
             for peer in map(str, self.session.info.peers_zid()):
-                # A program that shows another session has left this one, which Zenoh may not close.
+                # A program with another session has left this session, which Zenoh may not close.
                 program, alive = self._sessions.get(peer, ("", True))
                 other = (program, True) in self._sessions.values()
                 self.suspect(f"the token of {peer} is missing", so=not alive and not other)
@@ -147,11 +147,11 @@ class Peer:
         self.declare(lambda session: self._watched(session, on_token))
 
     def on_rc(self, rc: str, alive: bool) -> None:
-        """The token of an RC has come or gone."""
+        """The token of an RC has appeared or disappeared."""
 
     def _watched(self, session: zenoh.Session, on_token: Callable[[zenoh.Sample], None]) -> Any:
         def on_sample(sample: zenoh.Sample) -> None:
-            # What a session hears that is being left is its own end.
+            # Samples of an old session, which is being closed, only report its own end.
             if session is self.session:
                 on_token(sample)
 
@@ -176,7 +176,7 @@ class Peer:
         self.declare(lambda session: session.declare_subscriber(f"{self.base}/{key}", on_sample))
 
     def tick(self) -> None:
-        """Called often: a step that was too long was a standstill."""
+        """Call this often: a long time between two calls is a stall."""
         with self.lock:
             at = now()
             if at - self._ticked > STALL:
@@ -184,7 +184,7 @@ class Peer:
             self._ticked = at
 
     def stalled(self, arrived: int | None = None) -> int:
-        """How long a standstill lasted that has just ended, or had when something arrived."""
+        """The length in ns of a stall that has just ended, or had just ended at `arrived`; else 0."""
         with self.lock:
             at = now()
             if at - self._ticked > STALL:
@@ -193,12 +193,12 @@ class Peer:
             return length if (at if arrived is None else arrived) - end < STALL else 0
 
     def believes(self, term: Term, known: Term, *, always: bool = False) -> bool:
-        """ "Order": an absurd term is ignored while an RCM is heard."""
+        """ "Order": an absurd term is ignored while an RCM publishes."""
         near = always or now() - self.heard > HOLD_LEASE or term[0] <= known[0] + MAX_JUMP
         return term[0] < MAX_COUNTER and near
 
     def get(self, key: str, schema: str, message: Json, timeout: float = QUERY_TIMEOUT) -> list[tuple[bool, Json]]:
-        """All answers, as (whether it is none of a problem, payload). None at all means unknown."""
+        """All answers, as (True unless it is a problem, payload). An empty list means unknown."""
         return answers(self.session, f"{self.base}/{key}", schema, message, timeout)
 
     def serve(self, key: str, answer: Callable[[zenoh.Query], Json], schema: str) -> None:
@@ -231,7 +231,7 @@ class Held:
 
 
 class Rc:
-    """One device of no substance. Its worker carries out commands one at a time."""
+    """An imaginary device. Its worker carries out commands one at a time."""
 
     def __init__(self, peer: Peer, name: str) -> None:
         self.peer, self.name, self.capacity = peer, name, CAPACITY.get(name)
@@ -240,16 +240,16 @@ class Rc:
         self.held: dict[Grant, Held] = {}
         self.ended: OrderedDict[Grant, str] = OrderedDict()
         self.awaited: set[Grant] = set()
-        """What a snapshot named while something else was held."""
+        """Grants that a snapshot named while another was held."""
         self.commands: queue.Queue[tuple[int, zenoh.Query]] = queue.Queue(64)
         self.promised = NO_TERM
         self.behind = False
-        """Something was missed that has not been read yet."""
+        """True if something was missed and not read yet."""
         self.led: set[str] = set()
-        """The RCMs that were seen at the last look."""
+        """The visible RCMs at the last look."""
 
     def begin(self) -> None:
-        """ "Beginning", but for the subscriptions, which the process has once."""
+        """ "Beginning", without the subscriptions, which all RCs of the process share."""
         self.read()
         self.peer.serve(f"rc/{self.name}/state", self.on_state, "RcState")
         self.peer.queryable(f"rc/{self.name}/command/*/*", self.on_command)
@@ -259,14 +259,14 @@ class Rc:
         self.peer.declare(lambda session: self.peer.show(session, "rc", self.name, self.instance))
 
     def look(self) -> None:
-        """An RCM that is seen publishes, and asks for a promise."""
+        """Check that a visible RCM publishes, and asks for a promise."""
         heard = now() - self.peer.heard < HOLD_LEASE // 2
         leaders = {key.rpartition("/")[2] for key in self.peer.leaders}
         if self.promised[1] in self.led - leaders:
             self.promised = NO_TERM
         self.led = leaders
-        self.peer.suspect("an RCM is seen and not heard", so=bool(self.peer.leaders) and not heard)
-        self.peer.suspect("an RCM is heard and not seen", so=heard and not self.peer.leaders)
+        self.peer.suspect("an RCM is seen and does not publish", so=bool(self.peer.leaders) and not heard)
+        self.peer.suspect("an RCM publishes and is not seen", so=heard and not self.peer.leaders)
         self.peer.suspect(f"{self.name} is not asked", so=heard and self.promised != self.term)
 
     def trace(self, do: str, **what: Any) -> None:
@@ -310,7 +310,7 @@ class Rc:
         return True
 
     def on_grants(self, said: Json) -> bool:
-        """Whether something was missed, and `rcm/state` is to be read."""
+        """Return True if something was missed, so that `rcm/state` must be read."""
         before, known = (self.term, self.seq), set(self.held)
         if not self._accepts(said):
             return False
@@ -324,7 +324,7 @@ class Rc:
                 wanted, announce = {max(wanted): wanted[max(wanted)]}, True
             self.awaited.clear()
             for grant in known - wanted.keys():
-                self._end(grant, "the RCM says so")
+                self._end(grant, "ended by the RCM")
             for grant, holder in wanted.items():
                 announce |= grant in self.ended
                 self._begin(grant, holder)
@@ -349,7 +349,7 @@ class Rc:
         answers = [said for good, said in self.peer.get("rcm/state", "StateAsk", {"holds_only": True}, 0.5) if good]
         with self.peer.lock:
             believed = [said for said in answers if self.peer.believes(term_of(said["term"]), self.term)]
-            said = max(believed, key=lambda one: (term_of(one["term"]), one["seq"]), default=None)
+            said = max(believed, key=lambda state: (term_of(state["term"]), state["seq"]), default=None)
             if said is None or not self._accepts(said):
                 return
             self.behind = False
@@ -358,7 +358,7 @@ class Rc:
             for grant, view in views.items() if named == self.instance else ():
                 holder = {name: value for name, value in view.items() if name not in ("needs", "held")}
                 holder |= {"rcs": sorted(view["needs"]), "params": view["needs"][self.name]}
-                others = [held.holder for one, held in self.held.items() if one != grant]
+                others = [held.holder for other, held in self.held.items() if other != grant]
                 if not others or (self.capacity is not None and not self._veto([*others, holder])):
                     self._begin(grant, holder)
                 elif grant not in self.held:
@@ -376,14 +376,14 @@ class Rc:
         gone = [grant for grant in self.held if silent or grant in over]
         if not gone:
             return
-        told = [
+        endings = [
             {"id": self.held[grant].holder["id"], "grant": grant, "why": "lease" if silent else "time"}
             for grant in gone
         ]
         for grant in gone:
             self._end(grant, "lease" if silent else "its time is over")
         self.trace("end")
-        self.publish(told)
+        self.publish(endings)
 
     # "Commands", "Votes", "State"
 
@@ -408,7 +408,7 @@ class Rc:
     def obey(self, query: zenoh.Query, command: Json, arrived: int) -> Json:
         with self.peer.lock:
             if now() - arrived + self.peer.stalled(arrived) > command.get("ttl", 1.0) * SECOND:
-                raise Refused("stale", "it waited longer than its ttl")
+                raise Refused("stale", "the command waited longer than its ttl")
             if command.get("grant") is None:
                 raise Refused("no_grant", "only under a grant")
             grant, sender = grant_of(command["grant"]), "/".join(str(query.key_expr).split("/")[-2:])
@@ -497,7 +497,7 @@ def run_rcs(peer: Peer, over: threading.Event) -> None:
 
 @dataclass
 class Request:
-    """One that is not over, and the newest word about it."""
+    """An open request, and its newest notice."""
 
     asked: Json
     state: str = "asking"
@@ -506,7 +506,7 @@ class Request:
     rcs: list[str] = field(default_factory=list)
     unconfirmed: Json = field(default_factory=dict)
     missing: dict[str, bool] = field(default_factory=dict)
-    """RCs that did not confirm its last grant, and whether each is seen."""
+    """RCs that did not confirm its last grant; True if the RC is visible."""
     reachable: bool = False
     last: tuple[Term, int] = (NO_TERM, 0)
     end: int = 0
@@ -515,7 +515,7 @@ class Request:
 
 
 class Client(Peer):
-    """Three threads, one for each job, each with one request at a time."""
+    """A thread for each of three jobs, each with one request at a time."""
 
     def __init__(self, join: Callable[[], zenoh.Session], program: str, fleet: str, host: str, seed: str) -> None:
         super().__init__(join, program, fleet, host, seed)
@@ -538,7 +538,7 @@ class Client(Peer):
         self.declare(lambda session: self.show(session, "client", CLIENT, self.instance))
 
     def renew(self) -> None:
-        """A new token before the old one goes, at most twice a second."""
+        """Declare a new token before the old token is undeclared, at most twice a second."""
         with self.lock:
             if now() - self.shown > SECOND // 2:
                 self.instance, self.shown = secrets.token_hex(6), now()
@@ -546,17 +546,17 @@ class Client(Peer):
                 self.declared[-1] = self._makes[-1](self.session)
                 before.undeclare()
 
-    # What is heard
+    # Received messages
 
     def on_notice(self, sample: zenoh.Sample) -> None:
         notice = json.loads(sample.payload.to_bytes())
-        # Zenoh may mix up keys where a link came back: what is published on another arrives here.
-        self.suspect("what is no notice arrives as one", so="id" not in notice)
+        # After a link came back, Zenoh may mix up keys: messages for another key arrive here.
+        self.suspect("another message arrives as a notice", so="id" not in notice)
         if "id" in notice:
             self.take(notice)
 
     def take(self, notice: Json) -> None:
-        """ "Order", "Asking": the newest word counts, however it came."""
+        """ "Order", "Asking": the newest notice counts, however it came."""
         with self.news:
             term = term_of(notice["term"])
             if term < self.term or not self.believes(term, self.term):
@@ -590,7 +590,7 @@ class Client(Peer):
             self.news.notify_all()
 
     def on_rc(self, rc: str, alive: bool) -> None:
-        """ "Entering": the link to one that did not confirm is back."""
+        """ "Entering": the link to an RC that did not confirm is back."""
         with self.news:
             for request in self.requests.values():
                 if rc in request.missing:
@@ -600,7 +600,7 @@ class Client(Peer):
             self.news.notify_all()
 
     def ask_anew(self, request: Request) -> None:
-        """It had its time, and this client never heard of it."""
+        """Ask under a new id: the hold had its time, and this client never knew of it."""
         old, new = request.asked["id"], secrets.token_hex(8)
         say("anew", id=old, new=new)
         request.asked["id"], request.last = new, (NO_TERM, 0)
@@ -627,13 +627,13 @@ class Client(Peer):
                 if term_of(promise) < self.term or not self.believes(term_of(promise), self.term):
                     raise Refused("old_term", "a higher term is known", self.term)
                 self.term = term_of(promise)
-            return {"client": self.me, "requests": [self.told(request) for request in self.requests.values()]}
+            return {"client": self.me, "requests": [self.view(request) for request in self.requests.values()]}
 
-    def told(self, request: Request) -> Json:
-        told = request.asked | ({"place": request.place} if request.place is not None else {})
-        return told | ({"grant": request.grant, "rcs": request.rcs} if request.grant is not None else {})
+    def view(self, request: Request) -> Json:
+        view = request.asked | ({"place": request.place} if request.place is not None else {})
+        return view | ({"grant": request.grant, "rcs": request.rcs} if request.grant is not None else {})
 
-    # What is asked
+    # Requests
 
     def schedule(self, schema: str, message: Json) -> list[tuple[bool, Json]]:
         replies = self.get(f"rcm/schedule/{self.me}", schema, message)
@@ -646,7 +646,7 @@ class Client(Peer):
 
     def ask(self, request: Request) -> None:
         with self.lock:
-            message = self.told(request) | request.unconfirmed | {"op": "request"}
+            message = self.view(request) | request.unconfirmed | {"op": "request"}
             if self.ahead or request.place is not None:
                 message["term"] = self.term
             if request.reachable:
@@ -669,7 +669,7 @@ class Client(Peer):
                 request.pause = min(SECOND, 2 * request.pause)
 
     def command(self, rc: str, grant: Any, action: Json, timeout: float = QUERY_TIMEOUT) -> str:
-        """The code of a refusal, `unknown` without an answer, or nothing."""
+        """Return the code of a refusal, `unknown` without an answer, or "" on success."""
         sent = now()
         replies = self.get(f"rc/{rc}/command/{self.me}", "Command", {"grant": grant, "do": action}, timeout)
         code = "" if replies and replies[0][0] else str(replies[0][1]["code"]) if replies else "unknown"
@@ -681,7 +681,7 @@ class Client(Peer):
         refused: list[str] = []
         until = now() + SECOND
 
-        def one(rc: str) -> None:
+        def confirm_at(rc: str) -> None:
             pause = 0.05
             while True:
                 code = self.command(rc, grant, {"name": "confirm"}, max(0.05, (until - now()) / SECOND))
@@ -694,7 +694,7 @@ class Client(Peer):
             if code:
                 refused.append(rc)
 
-        threads = [threading.Thread(target=one, args=(rc,)) for rc in request.rcs]
+        threads = [threading.Thread(target=confirm_at, args=(rc,)) for rc in request.rcs]
         for thread in threads:
             thread.start()
         for thread in threads:
@@ -712,12 +712,12 @@ class Client(Peer):
             return True
 
     def lose(self, request: Request, why: str) -> None:
-        """By this client's own judgement; it asks again."""
+        """The client judges the hold as lost, and asks again."""
         say("lost", id=request.asked["id"], grant=request.grant, reason=why)
         request.state, request.grant, request.due = "asking", None, now()
 
     def use(self, request: Request, grant: Any, lasts: float) -> bool:
-        """Whether the request is over with the hold: made use of, or its time is over."""
+        """Use the hold. Return True if the request is over with it: its work is done, or its time is over."""
         until = now() + round(lasts * SECOND)
         while True:
             with self.news:
@@ -732,12 +732,12 @@ class Client(Peer):
                 if code in NOT_MINE:
                     self.news.wait_for(lambda: request.grant != grant, 1.0)
                     if request.grant == grant and now() < request.end:
-                        self.lose(request, f"an RC says {code}")
+                        self.lose(request, f"an RC answered {code}")
                     return bool(request.grant == grant)
                 self.news.wait_for(lambda: request.grant != grant, 0.05)
 
     def serve_request(self, asked: Json, lasts: float, over: threading.Event) -> None:
-        """One request from its first asking to its end."""
+        """Serve a request from its start to its end."""
         request = Request(asked, due=now())
         with self.lock:
             self.requests[asked["id"]] = request
@@ -761,7 +761,7 @@ class Client(Peer):
             self.release(asked["id"], over)
 
     def release(self, request_id: str, over: threading.Event) -> None:
-        """ "Ending": asked again until somebody answers."""
+        """ "Ending": repeated until an RCM answers."""
         pause = 0.05
         while not any(good for good, _ in self.schedule("Release", {"op": "release", "id": request_id})):
             if over.wait(pause):
@@ -785,7 +785,7 @@ class Client(Peer):
                 return
             for request in self.requests.values():
                 if request.grant is not None:
-                    self.lose(request, "no RCM was heard for the hold lease")
+                    self.lose(request, "no RCM published for the hold lease")
             self.news.notify_all()
 
 
@@ -828,7 +828,7 @@ def main() -> None:
     program = "program" if what == "client" else "rcs"
 
     def join() -> zenoh.Session:
-        """ "Joining": its id is greater than those of sessions that began before."""
+        """ "Joining": its id is greater than the ids of earlier sessions."""
         config.insert_json5("id", f'"1{secrets.token_hex(9)}0{time.time_ns().to_bytes(8, "little").hex()[4:]}"')
         return zenoh.open(config)
 

@@ -16,13 +16,13 @@ from typing import Final, Protocol
 
 PREFIX: Final = "zc"
 NOWHERE: Final = "02:00:00:00:ff:ff"
-"""Nobody has this address: what is sent there is lost without a word."""
+"""An unused address: packets to it are lost silently."""
 ESTABLISHED: Final = "01"
 COMMAND_TIMEOUT: Final = 20.0
 
 
 class NoNamespaces(Exception):
-    """Why there can be no network namespaces here."""
+    """Network namespaces are not possible here."""
 
 
 def check() -> None:
@@ -43,8 +43,8 @@ def check() -> None:
 
 
 def end_on_signals() -> None:
-    """SIGINT and SIGTERM raise KeyboardInterrupt, so that no namespace stays. A shell has programs in the background
-    ignore the first, and the second would end this one at once."""
+    """Let SIGINT and SIGTERM raise KeyboardInterrupt, so that namespaces are removed. By default programs in the
+    background of a shell ignore SIGINT, and SIGTERM ends a program at once."""
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.default_int_handler)
 
@@ -55,21 +55,21 @@ def ip(*words: str) -> str:
 
 
 class Spaces(Protocol):
-    """Where hosts are."""
+    """The namespaces of hosts."""
 
     def space(self, host: str) -> str:
         """The namespace of a host."""
 
 
 class Net:
-    """All hosts on one bridge. Neighbours are set by hand, so a way from one host to another is cut, silently and in
-    one direction, by a wrong hardware address."""
+    """All hosts on one bridge. Neighbours are static, so that a wrong hardware address cuts a way from one host to
+    another, silently and in one direction."""
 
     def __init__(self, hosts: Sequence[str]) -> None:
         self.hosts = list(hosts)
         self.mark = f"{PREFIX}{os.getpid()}"
         self.cuts: set[tuple[str, str]] = set()
-        """From, to."""
+        """Cut ways: from, to."""
         self.unplugged: set[str] = set()
         self._addresses = {host: f"10.83.0.{number}" for number, host in enumerate(self.hosts, 1)}
         self._further = (f"10.83.{high}.{low}" for high in range(1, 255) for low in range(1, 255))
@@ -103,7 +103,7 @@ class Net:
             self._configure(host)
 
     def _configure(self, host: str) -> None:
-        """What goes when a link goes down."""
+        """Set the routes and neighbours, which are lost when a link goes down."""
         ways = "".join(self._way(host, other, whole=True) for other in self.hosts if other != host)
         self._batch({host: f"route replace 224.0.0.0/4 dev eth0\n{ways}"})
 
@@ -127,7 +127,7 @@ class Net:
                 raise RuntimeError(f"ip -batch: {errors}")
 
     def cut(self, ways: Iterable[tuple[str, str]]) -> None:
-        """Exactly these ways are cut from now on."""
+        """Cut exactly these ways, and restore others."""
         wanted = set(ways)
         changed: dict[str, str] = {}
         for source, target in sorted(wanted ^ self.cuts):
@@ -150,7 +150,7 @@ class Net:
         ip("-n", self.space(host), "addr", "flush", "dev", "eth0")
 
     def give_address(self, host: str) -> None:
-        """Another one than it had."""
+        """Give the host a new address, which no host has had."""
         self._addresses[host] = next(self._further)
         ip("-n", self.space(host), "addr", "add", f"{self.address(host)}/16", "dev", "eth0")
         self._configure(host)
@@ -163,13 +163,13 @@ class Net:
 
 
 def remove(mark: str) -> None:
-    """All namespaces, links and the bridge that bear this mark."""
+    """Remove all namespaces, links and the bridge with this mark."""
 
     def run(*words: str) -> str:
         command = ["ip", *words]
         return subprocess.run(command, capture_output=True, text=True, check=False, timeout=COMMAND_TIMEOUT).stdout
 
-    # A namespace that goes takes its end of a pair away some time later; a pair that is deleted is gone at once.
+    # Delete the pairs first: with a removed namespace, its end of a pair disappears only some time later.
     for line in run("-brief", "link").splitlines():
         if line.startswith(f"{mark}p"):
             run("link", "del", line.split("@")[0])
@@ -180,7 +180,7 @@ def remove(mark: str) -> None:
 
 
 def remove_leftovers() -> None:
-    """What a run that was killed could not take away."""
+    """Remove the leftovers of runs that were killed."""
     for space in ip("netns", "list").splitlines():
         mark = space.split("-")[0]
         number = mark.removeprefix(PREFIX)
@@ -189,13 +189,13 @@ def remove_leftovers() -> None:
 
 
 class Links:
-    """Which TCP links between hosts stand, from the kernel's tables. One that is retransmitting does not stand yet."""
+    """Working TCP links between hosts, from the kernel's tables. A retransmitting link does not count as working."""
 
     def __init__(self, net: Net) -> None:
         self._net = net
 
     def standing(self, pids: dict[str, int]) -> dict[frozenset[str], frozenset[int]]:
-        """By pair of hosts: the ports of the links that stand between them."""
+        """The ports of the working links, by pair of hosts."""
         ends: dict[tuple[str, str], set[tuple[int, int]]] = {}
         names = {self._net.address(host): host for host in self._net.hosts}
         for host, pid in pids.items():
@@ -211,7 +211,7 @@ class Links:
     @staticmethod
     def _connections(pid: int, names: Mapping[str, str]) -> Iterable[tuple[int, int, str]]:
         lines = []
-        for table in ("tcp", "tcp6"):  # who listens on both has its links in the second
+        for table in ("tcp", "tcp6"):  # sockets for both protocols are in the second
             with suppress(OSError):
                 lines += Path(f"/proc/{pid}/net/{table}").read_text().splitlines()[1:]
         for line in lines:
@@ -235,7 +235,7 @@ def _dies_with_its_parent() -> None:
 
 
 class Processes:
-    """One process for each host, in its namespace; its output goes to `<host>.log` of the folder."""
+    """A process for each host, in its namespace. Its output goes to `<host>.log` in the folder."""
 
     def __init__(self, net: Spaces, folder: Path) -> None:
         self._net, self._folder = net, folder
@@ -245,7 +245,7 @@ class Processes:
         self._env = {name: value for name, value in os.environ.items() if not name.startswith("ZSCOUT_")}
 
     def start(self, host: str, command: Sequence[str] | None = None) -> None:
-        """Starts a host's process, or starts it again."""
+        """Start a host's process, or restart it."""
         if command is not None:
             self._commands[host] = list(command)
         self.starts[host] += 1

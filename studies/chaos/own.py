@@ -1,4 +1,4 @@
-"""A client of zscout's own, with the same jobs as the foreign one, and telling the same.
+"""A client of zscout's own, with the same jobs and logged events as the foreign client.
 
 python -m studies.chaos.own FLEET_FILE HOST SEED"""
 
@@ -26,10 +26,10 @@ class Worker:
         self.quiet = asyncio.Event()
         self._believed: dict[str, Grant | None] = {}
         self._ids: dict[str, str] = {}
-        """By ARC: the id under which it was told of last."""
-        client.internals.watch(self._told)
+        """The id of each ARC in the last event."""
+        client.internals.watch(self._on_change)
 
-    def _told(self, arc: OpenArc) -> None:
+    def _on_change(self, arc: OpenArc) -> None:
         if (known_as := self._ids.setdefault(arc.name, arc.id)) != arc.id:
             say("anew", id=known_as, new=arc.id)
             self._ids[arc.name] = arc.id

@@ -1,4 +1,4 @@
-"""What a run is to be remembered by."""
+"""The figures of a chaos run."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from studies.chaos.faults import KINDS, SECOND, Fault
 
 Figures: TypeAlias = dict[str, Any]
 MEASURES: Final = {
-    "next_grant": "from a fault to the next grant that was asked for after it",
-    "healed": "from its end until everybody is served",
-    "zenoh": "of that, until the last link and token stand again",
-    "ours": "the rest of that",
+    "next_grant": "from a fault to the first grant of a request made after it",
+    "healed": "from its end until all clients are served",
+    "zenoh": "the part of `healed` until the last link and token are back",
+    "ours": "the rest of `healed`",
 }
 
 
@@ -33,7 +33,7 @@ def spread(values: Sequence[float]) -> Figures:
 
 
 def figures(faults: Sequence[Fault]) -> dict[str, Figures]:
-    """By kind of fault, of those that came alone."""
+    """Figures of faults that came alone, by kind."""
     found = {}
     for kind in KINDS:
         alone = [fault for fault in faults if fault.kind == kind and fault.alone]
@@ -50,12 +50,14 @@ def figures(faults: Sequence[Fault]) -> dict[str, Figures]:
 
 
 def late(faults: Sequence[Fault], start: int) -> list[str]:
-    """Those after which it took us longest, of those that came alone."""
-    alone = sorted((fault for fault in faults if fault.alone and fault.served), key=lambda one: one.linked - one.served)
-    return [f"{(fault.served - fault.linked) / SECOND:.2f} s after {told(fault, start)}" for fault in alone[:5]]
+    """Texts of the faults with the longest times `ours`, among faults that came alone."""
+    alone = sorted(
+        (fault for fault in faults if fault.alone and fault.served), key=lambda fault: fault.linked - fault.served
+    )
+    return [f"{(fault.served - fault.linked) / SECOND:.2f} s after {describe(fault, start)}" for fault in alone[:5]]
 
 
-def told(fault: Fault, start: int) -> str:
+def describe(fault: Fault, start: int) -> str:
     return (
         f"{fault.kind} ({fault.how}) of {', '.join(fault.hosts or fault.touched)}"
         f" from {(fault.at - start) / SECOND:.2f} s for {(fault.mended - fault.at) / SECOND:.2f} s"
@@ -65,7 +67,7 @@ def told(fault: Fault, start: int) -> str:
 def around(violation: Violation, faults: Sequence[Fault], start: int) -> str:
     """The violation, with the last faults before it."""
     last = [fault for fault in faults if fault.at <= violation.at][-2:]
-    before = "; ".join(told(fault, start) for fault in last)
+    before = "; ".join(describe(fault, start) for fault in last)
     return (
         f"{(violation.at - start) / SECOND:9.3f} s  [{violation.promise}] {violation.text}  (after: {before or 'none'})"
     )

@@ -1,4 +1,4 @@
-"""A fleet in namespaces of its own, faults in it, and how long it takes after each."""
+"""A fleet in its own namespaces, faults in it, and the recovery times after them."""
 
 from __future__ import annotations
 
@@ -33,26 +33,26 @@ from studies.chaos.work import (
 )
 
 LOOK: Final = 0.02
-"""Seconds from one look at logs and links to the next."""
+"""Seconds between two looks at the logs."""
 LOOK_AT_LINKS: Final = 0.1
 STANDS: Final = 0.5
-"""Seconds after which a link stands again: those by which two are told of one another do not last as long."""
+"""Seconds after which a link counts as restored: short links, made only to exchange locators, end sooner."""
 BEGIN_WITHIN: Final = 60.0
 RECOVER_WITHIN: Final = 30.0
 SERVED_WITHIN: Final = 60.0
 FORGOTTEN_WITHIN: Final = 7.0
 PAIRS: Final = {frozenset(pair) for pair in itertools.combinations(HOSTS, 2) if not set(pair) <= set(CLIENTS)}
-"""Whose links matter: between clients there is nothing to say."""
+"""Pairs of hosts that need a link: all but those of two clients."""
 PUBLISH: Final = re.compile(rb'"do":"publish","term":\[(\d+),"(\w+)"\]')
-TOLD: Final = (b'"entered"', b'"running"', b'"asked"', b'"token"', b'"up"', b'"quiet"')
+FOLLOWED: Final = (b'"entered"', b'"running"', b'"asked"', b'"token"', b'"up"', b'"quiet"')
 
 
 class NotServed(Exception):
-    """What did not come about in time."""
+    """A condition was not met in time."""
 
 
 class Tail:
-    """What a program has written since the last look."""
+    """The lines that a program has written since the last look."""
 
     def __init__(self, file: Path) -> None:
         self._file, self._at, self._rest = file, 0, b""
@@ -71,7 +71,7 @@ class Tail:
 
 
 class Watch:
-    """What the programs tell while they run: who leads, who was granted what, and which tokens are back."""
+    """Follows the logs of the running programs: the leader, grants, and tokens that come back."""
 
     def __init__(self, folder: Path) -> None:
         self._tails = {host: Tail(folder / f"{host}.log") for host in HOSTS}
@@ -80,13 +80,13 @@ class Watch:
         self.up: Counter[str] = Counter()
         self.quiet: Counter[str] = Counter()
         self.entered: dict[str, int] = {}
-        """By client: when it entered last what it needs every host for."""
+        """When each client last entered a hold of job `all`."""
         self.waits: list[float] = []
-        """Seconds from asking to the first grant, of what nobody else wants."""
+        """Seconds from each request of job `near` to its first grant."""
         self.granted: list[tuple[int, int]] = []
-        """Grants of such: when it was asked, when it was granted."""
+        """Times of these requests and their grants."""
         self.token_back = 0
-        """When a token that had been seen before came back last."""
+        """When a known token last came back."""
         self._asked: dict[str, tuple[int, str]] = {}
         self._tokens: set[tuple[str, str]] = set()
 
@@ -98,7 +98,7 @@ class Watch:
                         term = int(found[1]), found[2].decode()
                         if term > self.term:
                             self.term, self.leader = term, host
-                elif any(word in line[:60] for word in TOLD) and line.startswith(b'{"at":'):
+                elif any(word in line[:60] for word in FOLLOWED) and line.startswith(b'{"at":'):
                     self._take(host, json.loads(line))
 
     def _take(self, host: str, event: Json) -> None:
@@ -125,9 +125,10 @@ class Watch:
 
 
 class Fleet:
-    """Three nodes, RCs and clients by the protocol page alone, and clients of zscout's own, each on a host of its own.
+    """Three nodes, RCs and clients written from the protocol page alone, and zscout's own clients, each on its own
+    host.
 
-    Nothing of it is left when the context ends, but for the folder."""
+    At the end of the context only the folder remains."""
 
     def __init__(self, folder: Path, seed: str, *, traced: bool = True) -> None:
         self.folder, self.seed = folder, seed
@@ -139,13 +140,13 @@ class Fleet:
         self._log = "debug" if traced else "warning"
         self._cuts: Counter[Way] = Counter()
         self._down: set[str] = set()
-        """Hosts whose process is killed or frozen."""
+        """Hosts with a killed or frozen process."""
         self._standing: dict[frozenset[str], frozenset[int]] = {}
         self._linked = self._looked = 0
         self._missing: dict[frozenset[str], int] = {}
-        """Since when pairs that lived had no link."""
+        """Pairs of running hosts without a link, and since when."""
         self._back: dict[frozenset[str], int] = {}
-        """Since when they have one again."""
+        """Pairs of `_missing` that have a link again, and since when."""
         self.apart: list[Apart] = []
         self.found: list[Violation] = []
 
@@ -193,7 +194,7 @@ class Fleet:
         file.write_text(text)
         self._start(host, "zscout.node", str(file), "--log-level", self._log)
 
-    # Looking
+    # Observing
 
     def look(self) -> None:
         self.watch.look()
@@ -203,7 +204,7 @@ class Fleet:
             self._look_at_links()
 
     def until(self, done: Callable[[], bool], within: float, what: str) -> None:
-        """Looks until it is so. Raises NotServed."""
+        """Look until `done`. Raises NotServed after `within` seconds; `what` names the condition."""
         deadline = time.monotonic() + within
         while not done():
             if time.monotonic() > deadline:
@@ -212,7 +213,7 @@ class Fleet:
             self.look()
 
     def rest(self, seconds: float, also: Callable[[], object] = lambda: None) -> None:
-        """Lets so much time pass, looking on."""
+        """Look for `seconds`, and call `also` at each look."""
         deadline = time.monotonic() + seconds
         while (left := deadline - time.monotonic()) > 0:
             time.sleep(min(LOOK, left))
@@ -281,7 +282,7 @@ class Fleet:
         self.marks.append((host, {"at": now(), "do": do, **what}))
 
     def recover(self, fault: Fault) -> None:
-        """Waits until every client has been granted something of every host."""
+        """Wait until every client has held RCs of every host since the fault's end."""
         self._linked = self.watch.token_back = 0
 
         def served() -> bool:
@@ -305,11 +306,12 @@ class Fleet:
 
 
 def random_faults(fleet: Fleet, rng: random.Random, kinds: list[str], until: Callable[[int], bool]) -> list[Fault]:
-    """Faults until there are enough. After some it is not waited until everybody is served, and some come by twos."""
+    """Faults `until` their number is enough. Some come in pairs, and some without waiting until all clients are
+    served."""
     faults: list[Fault] = []
     single = len(kinds) == 1
     while not until(len(faults)):
-        fleet.until(lambda: fleet.watch.leader not in fleet._down, RECOVER_WITHIN, "somebody leads")
+        fleet.until(lambda: fleet.watch.leader not in fleet._down, RECOVER_WITHIN, "a node leads")
         fault = draw(rng, kinds, fleet.watch.leader)
         faults.append(fault)
         fleet.begin(fault)
@@ -335,8 +337,7 @@ def random_faults(fleet: Fleet, rng: random.Random, kinds: list[str], until: Cal
 
 
 def finish(fleet: Fleet, faults: list[Fault]) -> tuple[list[Violation], Counter[str]]:
-    """No more faults and no more requests: all is served, all is forgotten, and what was told is held against the
-    promises."""
+    """End faults and requests, wait until all is served and released, and check the logs against the promises."""
     found = fleet.found
     try:
         fleet.until(

@@ -1,5 +1,6 @@
-"""`make soak`: a fleet at work for hours, live and in virtual time: what it uses in the beginning, in the middle and at
-the end. Exit code 0: nothing grew, 1: something did or a promise was broken, 2: it can't run here."""
+"""`make soak`: a fleet at work for hours, live and in virtual time, and the resources that it uses at the beginning, in
+the middle and at the end. Exit code 0: nothing grew; 1: something grew or a promise was broken; 2: it can't run
+here."""
 
 from __future__ import annotations
 
@@ -27,16 +28,16 @@ from zscout.rcm.request_log import MAX_LINES
 
 Figures: TypeAlias = dict[str, float]
 LOOKS: Final = 60
-"""Of a live run; the beginning, the middle and the end are the medians of a tenth of them."""
+"""Number of looks in a live run. The beginning, the middle and the end are medians of a tenth of them."""
 ROOM: Final = {"links": 0, "descriptors": 4, "memory_mb": 12, "latency_ms": 5, "objects": MAX_LINES}
-"""How much more there may be at the end than in the beginning, besides a tenth: the leader's history fills up."""
+"""Growth allowed from the beginning to the end, in addition to a tenth: the leader's history fills up."""
 FAULTS_PER_HOUR: Final = 60
 COLLECT_EVERY: Final = 20.0
 CONTAINERS: Final = {list, dict, set, tuple, deque, OrderedDict, defaultdict, Counter}
 
 
 def live(hours: float, folder: Path) -> tuple[list[dict[str, Figures]], list[str]]:
-    """What each of zscout's own processes uses, look by look, without faults; and what went wrong."""
+    """The resources that each process of zscout uses, by look, without faults; and texts of failures."""
     looks: list[dict[str, Figures]] = []
     with Fleet(folder, "soak", traced=False) as fleet:
         for _ in range(LOOKS):
@@ -60,7 +61,7 @@ def use(pid: int) -> Figures:
 
 
 def shorten(folder: Path) -> None:
-    """What was looked at is not kept."""
+    """Truncate long logs, whose lines have been read."""
     for log in folder.glob("*.log"):
         if log.stat().st_size > 20_000_000:
             with log.open("r+b") as file:
@@ -68,7 +69,7 @@ def shorten(folder: Path) -> None:
 
 
 class Soaked(Simulation):
-    """Counts what is in memory now and then, and keeps no story of the run, which would be the most of it."""
+    """Counts objects in memory at intervals. Drops the run's story, which would be most of them."""
 
     looks: list[dict[str, Figures]]
 
@@ -95,24 +96,26 @@ class Soaked(Simulation):
 
 
 def product_objects() -> int:
-    """Objects of zscout, and what their containers hold; not those of the simulator, whose checker remembers all that
-    has ever been promised."""
-    own = [one for one in gc.get_objects() if _is_product(one)]
+    """Number of objects of zscout and of items in their containers, without the simulator's, whose checker remembers
+    all promises."""
+    own = [thing for thing in gc.get_objects() if _is_product(thing)]
     seen, count = set(map(id, own)), 0
     while own:
         count += 1
-        for one in gc.get_referents(own.pop()):
-            if id(one) not in seen and (_is_product(one) or type(one) in CONTAINERS):
-                seen.add(id(one))
-                own.append(one)
+        for thing in gc.get_referents(own.pop()):
+            if id(thing) not in seen and (_is_product(thing) or type(thing) in CONTAINERS):
+                seen.add(id(thing))
+                own.append(thing)
     return count
 
 
-def _is_product(one: object) -> bool:
-    module = type(one).__module__
-    # The checker's memory is of grants and places, which are tuples.
+def _is_product(thing: object) -> bool:
+    module = type(thing).__module__
+    # Tuples are left out, because the checker remembers grants and places.
     return (
-        module.startswith("zscout.") and not module.startswith("zscout.testing.") and not isinstance(one, type | tuple)
+        module.startswith("zscout.")
+        and not module.startswith("zscout.testing.")
+        and not isinstance(thing, type | tuple)
     )
 
 
@@ -127,14 +130,14 @@ def virtual(hours: float) -> tuple[list[dict[str, Figures]], Result]:
 
 
 def thirds(looks: list[dict[str, Figures]]) -> dict[str, dict[str, list[float]]]:
-    """By process and measure: in the beginning, in the middle, at the end."""
+    """By process and measure: the values at the beginning, in the middle and at the end."""
     some = max(1, len(looks) // 10)
-    # What is allocated once is allocated by the second look.
+    # Without the first look, before which not all one-time allocations were made.
     parts = [looks[1 : 1 + some] or looks[:1], looks[len(looks) // 2 :][:some], looks[-some:]]
-    who = {host: list(figures) for host, figures in looks[0].items()}
+    measures = {host: list(figures) for host, figures in looks[0].items()}
     return {
         host: {name: [statistics.median(look[host][name] for look in part) for part in parts] for name in names}
-        for host, names in who.items()
+        for host, names in measures.items()
     }
 
 
@@ -150,9 +153,9 @@ def grown(found: dict[str, dict[str, list[float]]]) -> list[str]:
 def main() -> int:
     options = argparse.ArgumentParser(prog="python -m studies soak", description=__doc__)
     options.add_argument("--hours", type=float, default=8.0, help="live, and in virtual time (8)")
-    options.add_argument("--live", type=float, help="hours live, where that is another number")
-    options.add_argument("--virtual", type=float, help="hours of virtual time, where that is another number")
-    options.add_argument("--json", action="store_true", help="the report as JSON; so it is in a pipe, too")
+    options.add_argument("--live", type=float, help="hours live, if different from --hours")
+    options.add_argument("--virtual", type=float, help="hours of virtual time, if different from --hours")
+    options.add_argument("--json", action="store_true", help="print the report as JSON; always so in a pipe")
     asked = options.parse_args()
     hours = {"live": asked.live, "virtual": asked.virtual}
     hours = {name: asked.hours if value is None else value for name, value in hours.items()}

@@ -1,8 +1,8 @@
-"""What the clients of a chaos run ask for, and how all its programs tell what happens to them. Standard library only:
-clients that know nothing of the project use it too.
+"""The requests of the clients in a chaos run, and the events that all its programs log. Standard library only, because
+clients without any code of zscout use it too.
 
-Each client asks for three things, again and again: for an RC of its own (`near`: how soon is somebody granted?), for a
-line of every host with RCs (`all`: does everything work for it?), and for what others want as well (`work`)."""
+Each client makes three kinds of requests, again and again: for an RC of its own (`near`: how soon is a grant?), for a
+line of every host with RCs (`all`: does every host serve it?), and for RCs that others want as well (`work`)."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ CLIENT: Final = "worker"
 """The client's name at each of its hosts."""
 
 CAPACITY: Final = {f"line/{host}": 100 for host in NODES + RC_HOSTS} | {"radio/n1": 3, "radio/x1": 3}
-"""Of the sharable RCs: the rate that each carries."""
+"""The rate that each sharable RC carries."""
 WANTED: Final = (*(f"arm/{host}" for host in NODES + RC_HOSTS), "radio/n1", "radio/x1")
 PULSE: Final = {"near": 0.1, "all": 0.2, "work": 0.3}
-"""Seconds from the end of one request of a job to its next, about."""
+"""Approximate seconds from the end of a request to the next request of the same kind."""
 
 
 def near(client: str) -> str:
@@ -48,7 +48,7 @@ def rcs_of(host: str) -> list[str]:
 
 
 def draw(rng: random.Random, job: str, client: str) -> tuple[Json, float]:
-    """A request, and how long its hold is made use of."""
+    """A request, and the seconds for which its hold is used."""
     asked: Json = {"id": secrets.token_hex(8), "arc": f"{job}-{client}", "priority": 1, "min_runtime": 5}
     if job == "near":
         return asked | {"needs": {near(client): {}}}, 0.0
@@ -64,7 +64,7 @@ def draw(rng: random.Random, job: str, client: str) -> tuple[Json, float]:
 
 
 def now() -> int:
-    """Nanoseconds by the clock that `zscout.trace` uses, which all processes of a machine share."""
+    """Nanoseconds by the clock of `zscout.trace`, which all processes of a machine share."""
     return time.clock_gettime_ns(time.CLOCK_BOOTTIME)
 
 
