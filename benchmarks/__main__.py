@@ -1,4 +1,4 @@
-"""`make bench`: what a grant costs, as ratios to a bare Zenoh query of the same run."""
+"""`make bench`: the cost of grants, as ratios to a bare Zenoh query of the same run."""
 
 from __future__ import annotations
 
@@ -48,10 +48,12 @@ async def measure(rounds: int, crowds: int, members: int, before: str | None) ->
 def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
     parser.add_argument("--json", action="store_true", help="print one JSON object instead of a table")
-    parser.add_argument("--rounds", type=int, default=500, help="of each latency (default: 500)")
+    parser.add_argument("--rounds", type=int, default=500, help="rounds of each latency (default: 500)")
     parser.add_argument("--crowds", type=int, default=5, help="rounds of the crowd (default: 5)")
-    parser.add_argument("--programs", type=int, default=4, help="that the 20 behaviors run in (default: 4)")
-    parser.add_argument("--before", metavar="COMMIT", help="measured in the same rounds, from a fleet of its own")
+    parser.add_argument("--programs", type=int, default=4, help="programs that run the 20 behaviors (default: 4)")
+    parser.add_argument(
+        "--before", metavar="COMMIT", help="also measure this commit, in the same rounds and in a fleet of its own"
+    )
     args = parser.parse_args()
     if args.rounds < 10 or args.crowds < 1 or crowd.BEHAVIORS % args.programs:
         parser.error("at least 10 rounds and 1 crowd; programs must divide 20")

@@ -1,8 +1,8 @@
-"""The bare cost: a plain Zenoh query, with nothing of zscout on the path.
+"""The bare cost: a plain Zenoh query, without zscout.
 
-`python -m benchmarks.bare ADDRESS KEY --bytes N` is the other end, a child process (see child.py): a
-queryable whose direct callback sends N bytes. `--answer TEXT` sends TEXT instead, with the request's own id
-where it begins with one: a client takes no other answer.
+`python -m benchmarks.bare ADDRESS KEY --bytes N` is the other end, a child process (see child.py): a queryable whose
+direct callback sends N bytes. `--answer TEXT` sends TEXT instead; if it begins with an id, the query's id replaces it,
+as clients take no other answer.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ ID, ID_LENGTH = b'"id":"', 12
 
 
 def settings(address: str) -> zenoh.Config:
-    """A peer that finds others by multicast at `address`, on loopback."""
+    """Return the configuration of a peer that finds others by multicast at `address`, on loopback."""
     config = zenoh.Config()
     config.insert_json5("mode", '"peer"')
     config.insert_json5("scouting/multicast/address", f'"{address}"')
@@ -36,18 +36,18 @@ def settings(address: str) -> zenoh.Config:
 
 
 class BareQuery:
-    """Asks in two ways, and goes on with the one that proves faster."""
+    """A bare query, made in the faster of two ways."""
 
     def __init__(self, payload: bytes) -> None:
         self._payload = payload
         self.once, self.way = self._blocking, ""
 
     def hot(self) -> float:
-        """The last of HOT queries in a row."""
+        """Return the seconds of the last of HOT consecutive queries."""
         return [self.once() for _ in range(HOT)][-1]
 
     def choose(self, session: zenoh.Session) -> None:
-        """Waits for the other end, tries both ways, and goes on with the faster."""
+        """Wait for the other end, try both ways, and use the faster from then on."""
         self._session = session
         deadline = time.monotonic() + START
         while not self._answered():

@@ -1,4 +1,4 @@
-"""Other processes of a benchmark: each says when it is ready, and ends when its stdin is closed."""
+"""Child processes of a benchmark: each reports when it is ready, and ends when its stdin is closed."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ END = 20.0
 
 
 class Child:
-    """A process that takes orders as JSON lines, and reports so."""
+    """A process that takes orders and sends reports, both as JSON lines."""
 
     def __init__(
         self, command: Sequence[str], *, env: Mapping[str, str] | None = None, cwd: Path | None = None
@@ -29,14 +29,14 @@ class Child:
 
     @classmethod
     def of(cls, module: str, *args: str) -> Self:
-        """A module of this package."""
+        """Start a module of this package."""
         return cls([sys.executable, "-m", f"benchmarks.{module}", *args])
 
     def order(self, what: Any) -> None:
         print(json.dumps(what), file=self._orders, flush=True)
 
     def report(self) -> Any:
-        """The next thing that it says, as JSON; waits for it."""
+        """Wait for its next report."""
         line = self._reports.readline()
         assert line, f"{self._name} ended"
         return json.loads(line)
@@ -49,7 +49,7 @@ class Child:
 
 @contextmanager
 def child(module: str, *args: str) -> Iterator[Child]:
-    """Runs a module of this package until the end of the block."""
+    """Run a module of this package until the end of the block."""
     process = Child.of(module, *args)
     try:
         process.report()
@@ -59,5 +59,5 @@ def child(module: str, *args: str) -> Iterator[Child]:
 
 
 def ready() -> None:
-    """What a child says first."""
+    """Send a child's first report."""
     print(json.dumps("ready"), flush=True)

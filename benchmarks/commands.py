@@ -1,7 +1,7 @@
-"""`python -m benchmarks.commands`: what commands take from start to exit, beside their bare Zenoh queries.
+"""`python -m benchmarks.commands`: duration of commands from start to exit, compared with their bare Zenoh queries.
 
-A bare query is a Python program that does nothing but join the mesh as a plain Zenoh peer, ask what the command asks,
-and leave. Commands and bare queries are run in turn, so that both find the machine the same."""
+A bare query is a Python program that only joins the mesh as a plain Zenoh peer, sends the queries of the command, and
+leaves. Commands and bare queries are run in turn, so that both find the machine in the same state."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ with zenoh.open(config) as session:
         payload = payload.replace("bare-request", own)
         while not [reply for reply in session.get(key, payload=payload.encode(), timeout=5.0) if reply.ok or reply.err]:
             if time.monotonic() > until:
-                sys.exit(f"nobody answers on {key}")
+                sys.exit(f"no answer on {key}")
 """
 
 
@@ -49,7 +49,7 @@ with contextlib.redirect_stdout(io.StringIO()), contextlib.suppress(SystemExit):
     main(["status"], standalone_mode=False)
 print(*(name for name in sys.modules if name not in before and all(map(str.isidentifier, name.split(".")))))
 """
-"""Prints the modules that `zscout status` imports, in their order."""
+"""Prints the modules that `zscout status` imports, in order."""
 
 
 def text_of(message: object) -> str:
@@ -63,7 +63,7 @@ async def measure(rounds: int) -> list[Row]:
             client = await lab.client("bench")
             await lab.ready(client, "robot/a", "robot/b", "radio/rf0")
             held = await client.request("survey", {"robot/a": {}}, min_runtime=3600)
-            # As installed: with bytecode, wherever this runs.
+            # With bytecode, like an installed zscout.
             env = {key: value for key, value in lab.env.items() if key != "PYTHONDONTWRITEBYTECODE"}
             env |= {"PYTHONPYCACHEPREFIX": f"{name}/bytecode", "PYTHONPATH": os.pathsep.join(sys.path)}
             rows = await asyncio.to_thread(in_turn, commands_of(lab), env, rounds)
@@ -73,7 +73,7 @@ async def measure(rounds: int) -> list[Row]:
 
 
 def commands_of(lab: Lab) -> dict[str, tuple[list[str], list[str]]]:
-    """Name: the command, and its bare query."""
+    """Return by name each command and its bare query."""
     keys, address = Keys(lab.fleet.name), lab.fleet.mesh.multicast_address
     zscout = [sys.executable, "-m", "zscout.cli.main"]
     bare = [sys.executable, "-c", BARE, address]
@@ -133,7 +133,7 @@ def parts_of_status(env: dict[str, str], rounds: int) -> list[Row]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.commands", description=__doc__)
-    parser.add_argument("--rounds", type=int, default=15, help="of each command (default: 15)")
+    parser.add_argument("--rounds", type=int, default=15, help="runs of each command (default: 15)")
     args = parser.parse_args()
     if args.rounds < 1:
         parser.error("at least 1 round")

@@ -1,8 +1,8 @@
-"""Twenty behaviors that contend for ten RCs, against the same programs asking an empty queryable.
+"""Twenty behaviors that contend for ten RCs, compared with the same programs querying an empty queryable.
 
-The behaviors run in a few programs of equal size, each with one session on either mesh. Both are asked by
-the very same client code: request, wait for the grant, give back; a cycle counts when it is granted. One
-program is `python -m benchmarks.crowd`, a child process (see child.py) that takes orders as JSON lines.
+The behaviors run in a few programs of equal size, each with a session on either mesh. The same client code uses both:
+request, wait for the grant, give back; a cycle counts once it is granted. Each program is `python -m benchmarks.crowd`,
+a child process (see child.py) that takes orders as JSON lines.
 """
 
 from __future__ import annotations
@@ -48,13 +48,13 @@ GRANTED = Notice(
     rcs=EXCLUSIVE[:3],
     remaining=HOLD,
 )
-"""What the empty queryable says to everything."""
+"""The empty queryable's answer to any query."""
 
 
 async def crowd(
     lab: Lab, folder: Path, rounds: int, seconds: float, progress: Callable[[str], None], programs: int = PROGRAMS
 ) -> list[Row]:
-    """Rows for the grants a second, as a share of what the empty queryable answers."""
+    """Return the rows of the grants per second, as a share of the empty queryable's answers."""
     empty = Lab(folder)
     answer = messages.encode(GRANTED).decode()
     key = Keys(empty.fleet.name).schedule_any
@@ -90,7 +90,8 @@ async def crowd(
 
 
 async def behave(client: Client, rng: random.Random, until: float) -> int:
-    """One behavior: asks for one to five RCs, gives them back once granted, and again. Counts the grants."""
+    """Run one behavior: request one to five RCs, give them back once granted, and repeat. Return the number of
+    grants."""
     cycles = 0
     while time.monotonic() < until:
         needs = {rc: {} for rc in rng.sample(EXCLUSIVE, rng.randint(1, MOST))}  # type: ignore[var-annotated]
@@ -108,7 +109,7 @@ async def program(fleet_file: Path, empty_file: Path, number: int, behaviors: in
     }
     rngs = [random.Random(SEED + number * behaviors + which) for which in range(behaviors)]  # noqa: S311
     for client in clients.values():
-        # Once each is answered, all are linked.
+        # An answer shows that the client is linked.
         await client.end(await client.request("hello", {EXCLUSIVE[number]: {}}, min_runtime=HOLD))
     ready()
     while line := await asyncio.to_thread(sys.stdin.readline):

@@ -1,4 +1,4 @@
-"""The other end of the asyncio face: `Mesh.serve` that answers at once.
+"""The other end of queries through zscout's asyncio interface: a `Mesh.serve` that answers at once.
 
 `python -m benchmarks.face FLEET_FILE` is a child process (see child.py).
 """
@@ -31,11 +31,11 @@ NOTICE = Notice(
     rcs=["robot/r0"],
     remaining=60.0,
 )
-"""What a grant is answered with."""
+"""The answer to a granted request."""
 
 
 def key(keys: Keys) -> str:
-    """Where it answers: a key of the fleet that nothing else uses."""
+    """The key on which it answers: a key of the fleet that is otherwise unused."""
     return keys.vote(RC)
 
 

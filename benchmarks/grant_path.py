@@ -1,9 +1,8 @@
-"""The path of a grant: which modules execute from `zscout request robot/x -- true` to its body, hop by hop.
+"""The path of a grant: the modules that execute from `zscout request robot/x -- true` to its body, hop by hop.
 
-A node leads, another runs the RC. Profilers in these and in the command record every call in their main
-threads; Zenoh's own threads only put what arrives into the inbox. What also runs while nobody asks for
-anything (heartbeats, timers) is left out. Messages are structs without functions of their own: the modules
-that define them are not seen here.
+One node leads, another runs the RC. Profilers in both and in the command record every call in their main threads;
+Zenoh's threads only put arriving data into the inbox. Calls that also occur without requests (heartbeats, timers) are
+left out. Messages are structs without functions, so the modules that define them don't appear.
 """
 
 from __future__ import annotations
@@ -21,14 +20,14 @@ from tests.live.lab import Lab
 
 RC = "robot/x"
 IDLE = 3.0
-"""Seconds of which what runs in them counts as no part of a grant."""
+"""Seconds before the request in which calls don't count as part of a grant."""
 MS = 1_000_000
 ASKING = ("zscout.behaviors.client.rcm_link", "RcmLink.ask")
-"""Where the request leaves the client."""
+"""The call with which the request leaves the client."""
 
 
 async def trace(folder: Path) -> dict[str, list[Call]]:
-    """The calls in each of the three processes."""
+    """Record the calls in each of the three processes."""
     hook, traces = folder / "hook", folder / "traces"
     hook.mkdir()
     traces.mkdir()
@@ -56,8 +55,8 @@ async def trace(folder: Path) -> dict[str, list[Call]]:
 
 
 def path(calls: dict[str, list[Call]]) -> list[tuple[float, str, str, str]]:
-    """Each module once for each side: ms since the request left, side, module, the function of it that ran
-    first; in the order of time."""
+    """Return each module once per side, in order of time: ms since the request left, side, module, and its first
+    function."""
     start = next(at for at, *where in calls["client"] if tuple(where) == ASKING)
     end = calls["client"][-1][0]
     found = []

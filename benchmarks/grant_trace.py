@@ -1,4 +1,4 @@
-"""Records what a process of zscout executes, for `benchmarks.grant_path`; a `sitecustomize` installs it."""
+"""Record the calls in a process of zscout, for `benchmarks.grant_path`; a `sitecustomize` installs it."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from types import FrameType
 from typing import Any
 
 _OPTIMIZED = 1
-"""Flag of the code of functions, which that of modules and class bodies has not."""
+"""Flag of functions' code; code of modules and class bodies does not have it."""
 
 Call = tuple[int, str, str]
 """Monotonic clock in ns, module, qualified name."""
 
 
 def install(folder: Path) -> None:
-    """Records each call of a function of zscout in the main thread, coroutines that go on included. They are
-    written to a file of `folder` when a subprocess is started, or at the end."""
+    """Record each call of a function of zscout in the main thread, and each resumption of a coroutine. Writes them to a
+    file in `folder` when a subprocess is started, or at exit."""
     calls: list[Call] = []
 
     def profile(frame: FrameType, event: str, _: object) -> None:

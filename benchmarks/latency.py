@@ -1,4 +1,4 @@
-"""Latencies as a program on the mesh sees them, each against the bare query of the same rounds."""
+"""Latencies as a program on the mesh sees them, each compared with the bare query of the same rounds."""
 
 from __future__ import annotations
 
@@ -50,12 +50,12 @@ AIMS = {
 
 
 def fleet_of(folder: Path, strategy: StrategyName = "adaptive") -> Lab:
-    """Not started yet."""
+    """Return a lab whose nodes are not started yet."""
     return Lab(folder, candidates=["lead"], strategy=strategy)
 
 
 def commit(name: str, folder: Path) -> Path:
-    """The tree of a commit, in `folder`."""
+    """Unpack the tree of a commit in `folder`."""
     archive = folder.with_suffix(".tar")
     subprocess.run(["git", "-C", str(ROOT), "archive", f"--output={archive}", name], check=True)
     shutil.unpack_archive(archive, folder)
@@ -63,7 +63,7 @@ def commit(name: str, folder: Path) -> Path:
 
 
 async def hot(ask: Callable[[], Awaitable[object]]) -> float:
-    """Seconds of the last of HOT questions in a row."""
+    """Return the seconds of the last of HOT consecutive queries."""
     for _ in range(HOT):
         began = time.perf_counter()
         reply = await ask()
@@ -74,7 +74,7 @@ async def hot(ask: Callable[[], Awaitable[object]]) -> float:
 
 @contextmanager
 def programs(folder: Path, tree: Path = ROOT, strategy: StrategyName = "adaptive") -> Iterator[Child]:
-    """Two programs in a fleet of their own, all of that tree's commit."""
+    """Run two programs in a fleet of their own, all from the commit in `tree`."""
     folder.mkdir()
     command = [sys.executable, "-P", str(ROOT / "benchmarks" / "programs.py"), str(folder), strategy]
     process = Child(command, env=os.environ | {"PYTHONPATH": str(tree)}, cwd=tree)
@@ -86,8 +86,8 @@ def programs(folder: Path, tree: Path = ROOT, strategy: StrategyName = "adaptive
 
 
 async def latencies(folder: Path, rounds: int, progress: Callable[[str], None], before: str | None = None) -> list[Row]:
-    """Rows for the bare query and what programs wait for: of this tree, of the commit `before`, and of a fleet under
-    the strategy `priority`. Each has the machine for itself, in turns of a few rounds."""
+    """Return rows for the bare query and the latencies: of this tree, of the commit `before`, and of a fleet with the
+    strategy `priority`. Each has the machine to itself, in turns of a few rounds."""
     ask = len(messages.encode(Ask("0123456789ab", "bench", {EXCLUSIVE[0]: {}}, 0, 60)))  # type: ignore[arg-type]
     fleets: dict[str, tuple[Path, StrategyName]] = {"": (ROOT, "adaptive")}
     if before is not None:
@@ -118,7 +118,7 @@ async def latencies(folder: Path, rounds: int, progress: Callable[[str], None], 
 
 
 async def questions(lab: Lab, folder: Path, rounds: int, progress: Callable[[str], None]) -> list[Row]:
-    """Rows for the asyncio face of a bare query, and the balancer's answer."""
+    """Return rows for a query through zscout's asyncio interface, and for the balancer's answer."""
     client = await lab.client("bench")
     key, asked = face.key(client.mesh.keys), StateAsk(arc="x" * 100)
 
@@ -147,8 +147,8 @@ async def questions(lab: Lab, folder: Path, rounds: int, progress: Callable[[str
 
 @contextmanager
 def bare_query(folder: Path, size: int) -> Iterator[bare.BareQuery]:
-    """A bare query of so many bytes, on a mesh of its own."""
-    lab = fleet_of(folder)  # while it lives, its address is nobody else's
+    """Prepare a bare query of `size` bytes, on a mesh of its own."""
+    lab = fleet_of(folder)  # keeps its multicast address reserved
     address = lab.fleet.mesh.multicast_address
     with child("bare", address, bare.KEY, "--bytes", str(ANSWER)), zenoh.open(bare.settings(address)) as session:
         query = bare.BareQuery(b"x" * size)

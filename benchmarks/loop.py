@@ -1,4 +1,4 @@
-"""The event loop that the benchmark's programs run on: that of the node and of zscout's blocking clients."""
+"""The event loop of the benchmarks' programs, which nodes and zscout's blocking clients use too."""
 
 from __future__ import annotations
 

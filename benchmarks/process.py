@@ -1,4 +1,4 @@
-"""Whole processes: how long `zscout --help` takes, what a node that has nothing to do costs."""
+"""Costs of whole processes: the duration of `zscout --help`, and CPU and memory of an idle node."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from tests.live.lab import Lab
 IDLE = 10.0
 """Seconds over which idle CPU is measured."""
 SETTLED = 3.0
-"""Seconds after which a node's start has no part in that."""
+"""Seconds to wait before that, until nodes have started."""
 MEGA = 1e6
 
 
 def help_time(rounds: int) -> list[Row]:
-    """`zscout --help` and a Python that does nothing, in turn; the first of each only warms up."""
+    """Measure `zscout --help` and a Python that does nothing, in turn; the first run of each is a warm-up."""
     zscout = str(Path(sys.executable).with_name("zscout"))
     commands = {"nothing": [sys.executable, "-c", "pass"], "help": [zscout, "--help"]}
     samples = {name: Samples() for name in commands}
@@ -37,7 +37,7 @@ def help_time(rounds: int) -> list[Row]:
 
 
 async def idle(lab: Lab) -> list[Row]:
-    """Memory and CPU of nodes that nobody asks anything. The recorder is a process apart and not in this."""
+    """Measure memory and CPU of nodes without requests. The recorder, a separate process, is not included."""
     await asyncio.sleep(SETTLED)
     nodes = {host: psutil.Process(process.pid) for host, process in lab.nodes.items()}
 
@@ -62,6 +62,6 @@ async def idle(lab: Lab) -> list[Row]:
 
 
 def memory_after(lab: Lab) -> list[Row]:
-    """The same nodes' memory once all else was measured."""
+    """Measure the memory of the same nodes after all other measurements."""
     sizes = [psutil.Process(process.pid).memory_info().rss / MEGA for process in lab.nodes.values()]
     return [Row("RSS, largest node after all rounds", max(sizes), "MB", aim=80.0)]

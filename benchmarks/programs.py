@@ -1,6 +1,6 @@
-"""Two programs in a fleet of their own, and what they do: one process, `python -P programs.py FOLDER STRATEGY`, which
-takes the names of what to measure as JSON lines and says seconds. It knows no more of zscout than any commit has, so
-that the commit before can be measured beside this one, by the `zscout` and `tests` that PYTHONPATH finds first."""
+"""Two programs in a fleet of their own, in one process: `python -P programs.py FOLDER STRATEGY`, which takes the names
+of measurements as JSON lines and prints seconds. It uses only what every commit of zscout has, so that PYTHONPATH can
+choose the `zscout` and `tests` of an earlier commit."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ from zscout.behaviors.client.arc import hold
 EXCLUSIVE = [f"robot/r{number}" for number in range(10)]
 SHARABLE = ["radio/rf0", "video/ch1"]
 HOT = 3
-"""Times that each thing is done in a row, of which the last counts: an idle processor and cold caches cost
-more than anything that is measured here, and most where many processes take part."""
+"""Consecutive runs of each measurement, of which the last counts: an idle processor and cold caches cost more than the
+measured work, most of all with many processes."""
 HOLD = 60.0
 NEEDS: dict[str, dict[str, dict[str, Any]]] = {
     "1 RC": {EXCLUSIVE[0]: {}},
@@ -32,14 +32,14 @@ NEEDS: dict[str, dict[str, dict[str, Any]]] = {
 
 
 def start(lab: Lab) -> None:
-    """The RCM's node apart from those of the RCs, as on a mesh."""
+    """Start the RCM on one node, the RCs on two others."""
     lab.node("lead")
     lab.node("left", *EXCLUSIVE[0::2], f"{SHARABLE[0]}:rate=10")
     lab.node("right", *EXCLUSIVE[1::2], f"{SHARABLE[1]}:rate=10")
 
 
 async def running(client: Any, arc: Any) -> None:
-    """Waits for the grant alone."""
+    """Wait for the grant, without confirmations."""
     while arc.state != "running":
         assert arc.open, f"{arc.name} ended: {arc.reason}"
         await client.changed(arc)
@@ -48,7 +48,7 @@ async def running(client: Any, arc: Any) -> None:
 class Programs:
     def __init__(self, client: Any, second: Any) -> None:
         self.client, self.second = client, second
-        # Before a body was entered at the grant, it always waited for the confirmation.
+        # Older versions entered a body only after the confirmations, and don't have the argument.
         waits = "confirmed" in inspect.signature(client.granted).parameters
         self._confirmed: dict[str, Any] = {"confirmed": True} if waits else {}
 
@@ -72,12 +72,12 @@ class Programs:
         async with attempt as held:
             entered = time.perf_counter()
             if hasattr(held, "confirmed"):
-                # What goes on beside one body is not to be beside the next one's request.
+                # Confirmations of this hold must not overlap the next request.
                 await held.confirmed()
         return entered - began
 
     async def release(self, needs: Any) -> float:
-        """To the next grant."""
+        """Measure the time from a release to the next grant."""
         holder = await self.client.request("holder", needs, min_runtime=HOLD)
         await running(self.client, holder)
         waiter = await self.second.request("waiter", needs, min_runtime=HOLD)

@@ -1,4 +1,4 @@
-"""What one load report takes: of the whole host, and of the process tree of a node."""
+"""Processor time of one load report: of the whole host, and of a node's process tree."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from zscout.services.node.process_use import TreeMeter
 
 
 def costs(node: int, rounds: int = 200) -> list[Row]:
-    """Processor time for each; `node` is the process whose tree is looked at."""
+    """Return a row for each; `node` is the root of the process tree."""
     gauge, meter = Gauge("bench"), TreeMeter(node)
     return [
         _row("CPU of a load report", gauge.report, rounds),

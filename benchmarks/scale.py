@@ -1,9 +1,9 @@
-"""`python -m benchmarks.scale`: what one event costs the scheduling core against the size of the queue.
+"""`python -m benchmarks.scale`: cost of an event in the scheduling core, by the size of the queue.
 
-Nine of ten RCs are exclusive; the tenth shares 4 units among ARCs of 1 or 2, and its votes come at once. An
-ARC needs 1 to 4 RCs, at one of four priorities. Who leaves the queue is replaced, so that its size stays. With
-`--bookings N` so many are made before, each of 1 to 4 RCs for one hour of the next week, at one of the priorities; no
-two have an RC and an hour in common.
+Nine of ten RCs are exclusive; the tenth shares 4 units among ARCs of 1 or 2 units, and its votes arrive at once. An ARC
+needs 1 to 4 RCs, at one of four priorities. ARCs that leave the queue are replaced, so that its size is constant. With
+`--bookings N`, N bookings are made first, each of 1 to 4 RCs for one hour of the next week, at one of the priorities;
+no two share an RC and an hour.
 """
 
 from __future__ import annotations
@@ -50,13 +50,13 @@ HOUR: Ns = 3_600 * SECOND
 HOURS = 7 * 24
 KINDS = ("request", "release", "end of hold", "vote", "search", "full pass", "fill")
 MEANING = {
-    "request": "one ARC more",
-    "release": "a holder gives back, whoever can takes over",
-    "end of hold": "a minimum runtime is over, likewise",
-    "vote": "an answer arrives",
-    "search": "a slice of a search that goes on",
-    "full pass": "as if every RC had been freed, to no effect",
-    "fill": "the whole queue asks in one instant, as after a takeover",
+    "request": "one more ARC",
+    "release": "a holder gives back its RCs, and waiting ARCs get them",
+    "end of hold": "a minimum runtime is over, and waiting ARCs get the RCs",
+    "vote": "a vote arrives",
+    "search": "one slice of a longer search",
+    "full pass": "a pass over all RCs as if freed, without effect",
+    "fill": "the whole queue is requested at once, as after a takeover",
 }
 AIMS = {"request": 200e-6, "release": 200e-6, "end of hold": 200e-6, "full pass": 10e-3}
 """Medians, in seconds, at the largest size."""
@@ -65,7 +65,7 @@ BAR = 40
 
 @dataclass(frozen=True)
 class Point:
-    """One kind of event at one size; seconds."""
+    """Costs, in seconds, of one kind of event at one size."""
 
     kind: str
     rcs: int
@@ -74,7 +74,7 @@ class Point:
 
 
 class _FullPriority(Priority):
-    """The same as if every RC had been freed before each pass."""
+    """The strategy `priority`, with all RCs considered freed before each pass."""
 
     def run_pass(self, state: SchedulerState, actions: Actions) -> None:
         state.index.freed = state.mask(state.rcs)
@@ -90,7 +90,7 @@ class Fleet:
         self.rng, self.queue = Random(seed), queue  # noqa: S311
         self.core, self.now, self.number = Core(STRATEGIES[strategy](), policy), 0, 0
         self.ends: dict[ArcId, Ns] = {}
-        """Of those that run. `Core.status` would leave the processor's caches cold for what is timed."""
+        """End of each running hold. Calls of `Core.status` would leave cold caches for the timed calls."""
         self.sharable = {f"device/{number}": number % 10 == 0 for number in range(rcs)}
         self.names = list(self.sharable)
         self.samples = {kind: Samples() for kind in KINDS}
@@ -121,10 +121,10 @@ class Fleet:
         return Requested(ArcRequest(arc, client, self.needs(), rng.randrange(4), runtime))
 
     def send(self, kind: str, *events: Event) -> None:
-        """One instant, timed, and then each vote and each further pass that it takes."""
+        """Time the events of one instant, then each vote and each further pass that follows."""
         effects = self._timed(kind, *events)
         votes = list(self._votes(effects))
-        while votes or any(isinstance(one, WakeAt) and one.at == self.now for one in effects):
+        while votes or any(isinstance(effect, WakeAt) and effect.at == self.now for effect in effects):
             effects = self._timed("vote", votes.pop()) if votes else self._timed("search", Tick())
             votes += self._votes(effects)
 
@@ -197,7 +197,7 @@ def table(points: list[Point]) -> str:
 
 
 def plot(points: list[Point], rcs: int) -> str:
-    """Median cost against the size of the queue; each step to the right is the same factor."""
+    """Draw the median cost by the size of the queue, on a logarithmic axis."""
     low, high = 1e-6, 1.0
     lines = [f"median cost with {rcs} RCs, from {_span(low)} at the left to {_span(high)} at the right"]
     for kind in KINDS:
@@ -209,7 +209,7 @@ def plot(points: list[Point], rcs: int) -> str:
 
 
 def _million_additions() -> float:
-    """How fast this interpreter is here and now, in seconds."""
+    """Measure the speed of this interpreter: seconds for a million additions."""
     start = time.thread_time()
     sum(number + 1 for number in range(1_000_000))
     return time.thread_time() - start
@@ -226,11 +226,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.scale", description=__doc__)
     parser.add_argument("--json", action="store_true", help="print one JSON object instead of a table")
     parser.add_argument("--rounds", type=int, default=300, help="releases per size (default: 300)")
-    parser.add_argument("--seed", type=int, default=1, help="of the random requests (default: 1)")
+    parser.add_argument("--seed", type=int, default=1, help="seed of the random requests (default: 1)")
     parser.add_argument("--strategy", choices=("priority", "adaptive"), default="adaptive")
-    parser.add_argument("--bookings", type=int, default=0, help="so many are open (default: 0)")
-    parser.add_argument("--rcs", type=int, choices=RCS, help="only fleets of so many RCs")
-    parser.add_argument("--fair-shares", action="store_true", help="20 hosts, each with its share")
+    parser.add_argument("--bookings", type=int, default=0, help="number of open bookings (default: 0)")
+    parser.add_argument("--rcs", type=int, choices=RCS, help="measure only fleets with this number of RCs")
+    parser.add_argument("--fair-shares", action="store_true", help="fair shares for 20 hosts")
     args = parser.parse_args()
     policy = SchedulingPolicy(fair_shares=FairShares(86_400 * SECOND)) if args.fair_shares else DEFAULT
     if not 10 <= args.rounds <= 100_000:

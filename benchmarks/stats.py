@@ -8,7 +8,7 @@ from typing import Any
 
 
 class Samples:
-    """Durations of one kind, in seconds."""
+    """Durations in seconds."""
 
     def __init__(self) -> None:
         self.values: list[float] = []
@@ -28,7 +28,7 @@ class Samples:
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """One figure. `ratio` compares it with `against`; the aim is one for the ratio where there is one."""
+    """One figure. `ratio` compares it with `against`; `aim` applies to the ratio if there is one, else to the value."""
 
     name: str
     value: float
@@ -43,7 +43,7 @@ class Row:
 
     @property
     def met(self) -> bool | None:
-        """Whether the aim is met; None where there is none."""
+        """True if the aim is met; None without an aim."""
         if self.aim is None:
             return None
         measured = self.ratio if self.ratio is not None else self.value
@@ -56,7 +56,7 @@ class Row:
 def of_latency(
     name: str, samples: Samples, bare: Samples, *, aim: float | None = None, against: str = "bare query"
 ) -> Row:
-    """A row for a latency as a ratio of medians."""
+    """Return the row of a latency; its ratio compares medians."""
     return Row(
         name,
         samples.median * 1e6,
@@ -70,7 +70,7 @@ def of_latency(
 
 
 def table(rows: list[Row]) -> str:
-    """The rows as aligned text."""
+    """Return the rows as aligned text."""
     cells = [("figure", "value", "p99", "ratio", "to", "aim", "met", "rounds")]
     for row in rows:
         aim = "" if row.aim is None else f"{'>=' if row.at_least else '<='} {row.aim:g}"

@@ -17,7 +17,7 @@ from zscout.types import VERSION
 
 __version__ = VERSION
 
-# Of every program of ours, before it opens anything.
+# In each of zscout's programs, before it opens any file.
 open_standard_streams()
 
 if TYPE_CHECKING:

@@ -1,7 +1,7 @@
-"""`zscout-node`: what one host does in its fleet, as its node file says.
+"""`zscout-node`: one host's part of its fleet, configured by its node file.
 
-It stands as a candidate for the RCM, reports the host's load, runs the host's RCs, starts components, and
-runs the recorder as a process of its own.
+It is a candidate for the RCM, reports the host's load, runs the host's RCs, starts components, and runs the recorder as
+a process of its own.
 """
 
 from __future__ import annotations
@@ -59,26 +59,27 @@ from zscout.types import SECOND, clean
 log = logging.getLogger("zscout.node")
 
 LOOK_FOR_TWIN = 0.5
+"""Seconds to look for another node with the same name."""
 TWIN_SHOWN = 0.1
-"""Seconds for the token of another node to come."""
+"""Seconds for the token of such a node to arrive."""
 ALONE_AFTER = 3.0
-"""Seconds after which a node that is linked to nobody says so."""
+"""Seconds without any link after which a node logs a warning."""
 
 LIMITS = [f"limits.{name}" for name in RcmLimits.__struct_fields__ if name != "max_payload"]
-"""Keys that a running leader takes."""
+"""Keys that can be reloaded while this node leads."""
 
 THREADS_END = 5.0
-"""Seconds that threads of drivers have to end once all else has."""
+"""Seconds that threads of drivers have to end after all else."""
 
 
 class NodeFailed(Exception):
-    """A service of the node failed, and the node can't go on without it. It has been logged."""
+    """A service failed without which the node can't run; it has been logged."""
 
 
 async def run_node(
     node: Node, stop: asyncio.Event, reload: Reload | None = None, manager: ServiceManager | None = None
 ) -> None:
-    """Runs a node until `stop`. Raises MeshError where it can't begin, NodeFailed where it can't go on."""
+    """Run a node until `stop`. Raises MeshError if it can't start, NodeFailed if a service fails."""
     async with await ZenohMesh.open(node.fleet, Sender(node.host, "node"), follow=False) as mesh:
         await run_services(node, mesh, stop, reload, manager)
 
@@ -86,9 +87,9 @@ async def run_node(
 async def run_services(
     node: Node, mesh: Mesh, stop: asyncio.Event, reload: Reload | None = None, manager: ServiceManager | None = None
 ) -> None:
-    """The services of a node, until `stop` or until one fails. The recorder, the load reporter and the
-    candidate start again by themselves; an RC and the component host end the node, and all in order. Raises BadInput
-    where an RC's driver is missing."""
+    """Run the services of a node until `stop`, or until one fails. The recorder, the load reporter and the candidate
+    restart themselves; a failed RC or component host ends the node, in order. Raises BadInput if an RC's driver is
+    missing."""
     me, failures = mesh.me, list[Exception]()
     manager = manager or ServiceManager()
     folder = functools.cache(functools.partial(state_folder, node.fleet.name, me.host, node.state))
@@ -98,7 +99,7 @@ async def run_services(
         stop.set()
 
     async with AsyncExitStack() as stack:
-        # Two nodes of one name would answer each other's questions.
+        # Two nodes with one name would answer each other's queries.
         key, twin = mesh.keys.alive_any(Role.NODE), f"; end it, or set another host than {me.host} under [node]"
         living = await mesh.living(key, timeout=LOOK_FOR_TWIN)
         if any(token.host == me.host for token in living):
@@ -106,7 +107,7 @@ async def run_services(
         stall = StallWatch(mesh.now).start()
         stack.callback(stall.stop)
         mesh.watch_links()
-        # Of two that begin at one time the later one leaves.
+        # If two start at the same time, the later leaves.
         own = Token(me.host, Role.NODE, me.client, f"{time.time_ns() // 1_000:014x}{new_instance()}")
         token = mesh.alive(own)
         stack.callback(token.close)
@@ -125,10 +126,10 @@ async def run_services(
         copies: BookingKeeper | None = None
 
         def keep_copies() -> None:
-            """Keep copies of the fleet's bookings where RCs are. A candidate does so anyway."""
+            """Keep copies of the fleet's bookings on a node with RCs. A candidate does so in any case."""
             nonlocal copies
             if copies is None and rcs.controllers and not node.candidate:
-                copies, keeping = _keeper(mesh, node, folder()), Supervisor("what keeps bookings", fail)
+                copies, keeping = _keeper(mesh, node, folder()), Supervisor("booking keeper", fail)
                 copies.start(keeping)
                 stack.callback(copies.stop)
                 stack.push_async_callback(keeping.close)
@@ -182,7 +183,7 @@ async def run_services(
         if node.calendar is not None:
             stack.push_async_callback(await _serve_calendars(node.calendar, mesh, node.fleet.name))
         await components.start()
-        # Before all else: they give back their ARCs while there is an RCM and while there are RCs.
+        # Stopped first, so that components give back their ARCs while the RCM and the RCs still run.
         stack.push_async_callback(components.stop)
         status = f"{node.host} is on the mesh of fleet {node.fleet.name}"
         log.info(status)
@@ -217,7 +218,7 @@ async def run_services(
 
 
 def _look_for_twin(own: Token, other: Token, alive: bool) -> None:
-    """Both run then: each has begun where the other was not seen."""
+    """Log a second node with this name: both started without seeing each other, and both run."""
     if alive and other.host == own.host and other.instance != own.instance:
         log.error("another node named %s is on the mesh too; end one, or set another host under [node]", own.host)
 
@@ -234,27 +235,28 @@ async def _cancelled(task: asyncio.Task[None]) -> None:
 
 
 async def _serve_figures(metrics: MetricsConfig, figures: NodeFigures) -> Callable[[], Awaitable[None]]:
-    """Returns what ends it. Raises NodeFailed."""
+    """Return the function that stops it. Raises NodeFailed."""
     from zscout.services.metrics.server import MetricsServer
 
     server = MetricsServer(figures.samples, metrics.bind, metrics.port)
     if await _serve("metrics", server):
-        log.info("serves its figures at http://%s:%d/metrics", metrics.bind, server.port)
+        log.info("metrics at http://%s:%d/metrics", metrics.bind, server.port)
     return server.stop
 
 
 async def _serve_calendars(calendar: CalendarConfig, mesh: Mesh, fleet: str) -> Callable[[], Awaitable[None]]:
-    """Returns what ends it. Raises NodeFailed."""
+    """Return the function that stops it. Raises NodeFailed."""
     from zscout.services.bookings.calendar_server import CalendarServer
 
     server = CalendarServer(mesh, fleet, calendar.bind, calendar.port)
     if await _serve("calendar", server):
-        log.info("serves calendars at http://%s:%d/fleet.ics", calendar.bind, server.port)
+        log.info("calendars at http://%s:%d/fleet.ics", calendar.bind, server.port)
     return server.stop
 
 
 async def _serve(table: str, server: PlainHttpServer) -> bool:
-    """Return False if another user of this machine has the port: a node does without. Raises NodeFailed."""
+    """Start a server. Return False if another user of this machine has the port: the node runs without it. Raises
+    NodeFailed."""
     try:
         await server.start()
     except OSError as error:
@@ -263,7 +265,7 @@ async def _serve(table: str, server: PlainHttpServer) -> bool:
         if error.errno != errno.EADDRINUSE or not holders or not all(map(is_stranger, holders)):
             raise NodeFailed(words) from error
         log.error(  # noqa: TRY400 - one clear line
-            "%s; user %s has the port: going on without", words, ", ".join(map(user_name, holders))
+            "%s; user %s has the port: running without it", words, ", ".join(map(user_name, holders))
         )
         return False
     return True
@@ -297,16 +299,16 @@ async def _main(reload: Reload, manager: ServiceManager) -> None:
     try:
         await run_node(reload.node, stop, reload, manager)
     finally:
-        # Python puts back its handlers as it ends, and would be ended by a late one.
+        # Python restores its signal handlers at exit; a late SIGHUP would then kill it.
         signal.signal(signal.SIGHUP, signal.SIG_IGN)
-        # The interpreter waits for threads, and one of a driver may hang in its device.
+        # The interpreter waits for threads, and a driver's thread may hang in its device.
         last = threading.Timer(THREADS_END, _end)
         last.daemon = True
         last.start()
 
 
 def _end() -> None:
-    log.warning("a thread of a driver hangs: this process ends without it")
+    log.warning("a driver's thread hangs: exiting without it")
     logging.shutdown()
     os._exit(1)
 
@@ -317,9 +319,9 @@ def _end() -> None:
 @click.option("--log-level", type=click.Choice(["debug", "info", "warning", "error"]), default="info")
 @click.version_option(__version__)
 def main(file: Path | None, check: bool, log_level: str) -> None:
-    """Run this host's part of a fleet, as the node FILE (TOML) says.
+    """Run this host's part of a fleet, as configured by the node FILE (TOML).
 
-    Without FILE the node may lead the fleet "zscout", and reports the host's load. `zscout simulate --node lab.toml`
+    Without FILE, the node may lead the fleet "zscout" and reports the host's load. `zscout simulate --node lab.toml`
     writes a node file for a simulated building; docs/reference/configuration.md lists all settings.
 
     \b
@@ -337,8 +339,8 @@ def main(file: Path | None, check: bool, log_level: str) -> None:
             node = reload.node
             click.echo(f"{node.host} of fleet {node.fleet.name}: {file or 'the defaults'} can be used here")
             return
-        # What was imported stays: no collection looks through it while a leader decides. Young objects are many and few
-        # of them in cycles.
+        # Exclude all imported objects from collections, which would delay a leader's decisions. Collect young objects
+        # rarely: there are many, and few are in cycles.
         gc.freeze()
         gc.set_threshold(20_000, 20, 50)
         uvloop.run(_main(reload, manager))

@@ -36,7 +36,7 @@ def progress(text: str) -> None:
 
 @contextmanager
 def bare_query() -> Iterator[bare.BareQuery]:
-    """The plain query of `python -m benchmarks`, of the size of a request for one RC and of its grant."""
+    """Prepare the bare query of `python -m benchmarks`, with the sizes of a request for one RC and of its grant."""
     ask = len(messages.encode(Ask("0123456789ab", "bench", {"robot/r0": {}}, 0, 60)))  # type: ignore[arg-type]
     address = f"224.0.0.225:{random.randint(20_000, 60_000)}"  # noqa: S311
     size = str(len(messages.encode(face.NOTICE)))
@@ -47,7 +47,7 @@ def bare_query() -> Iterator[bare.BareQuery]:
 
 
 class Bench:
-    """zscout's own team, and one peer after the other beside it."""
+    """Compares each peer with zscout's own team."""
 
     def __init__(self, query: bare.BareQuery, home: work.Team, args: argparse.Namespace) -> None:
         self._query, self._home, self._args = query, home, args
@@ -56,7 +56,7 @@ class Bench:
         self._our_crowd = work.Crowd([], [0] * work.BEHAVIORS)
 
     async def contender(self, name: str, folder: Path) -> None:
-        """All work of one peer, or why there is none."""
+        """Measure all work of one peer, or record why it can't be measured."""
         who = name
         try:
             peer = load(name)
@@ -102,7 +102,7 @@ class Bench:
         ]
 
     def finish(self) -> None:
-        """zscout's own rows, out of all pairs of this run, before all others."""
+        """Add zscout's own rows, from all pairs of this run, before all others."""
         if not self._our_crowd.rates:
             return
         figures = [taken.figure(kind, HOME, away=False) for kind, taken in self._ours.items()]
@@ -128,9 +128,9 @@ def _made(folder: Path) -> Path:
 
 
 def _said(folder: Path) -> str:
-    """The last words of the programs whose logs are in `folder`."""
+    """Return the last log line of each program whose log is in `folder`."""
     said = [f"{log.stem}: {last_line(log)}" for log in sorted(folder.glob("p?.log")) if log.stat().st_size]
-    return "; ".join(said) or "its programs said nothing"
+    return "; ".join(said) or "its programs logged nothing"
 
 
 async def measure(args: argparse.Namespace) -> Report:
@@ -152,9 +152,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.peers", description=__doc__)
     parser.add_argument("peers", nargs="*", metavar="PEER", help=f"of {', '.join(NAMES[1:])} (default: all)")
     parser.add_argument("--json", action="store_true", help="print one JSON object instead of tables")
-    parser.add_argument("--rounds", type=int, default=150, help="of each latency (default: 150)")
+    parser.add_argument("--rounds", type=int, default=150, help="rounds of each latency (default: 150)")
     parser.add_argument(
-        "--seconds", type=float, default=20.0, help="at most, for the latencies of one peer (default: 20)"
+        "--seconds", type=float, default=20.0, help="most seconds for the latencies of one peer (default: 20)"
     )
     parser.add_argument("--crowds", type=int, default=3, help="rounds of the 20 behaviors (default: 3)")
     args = parser.parse_args()

@@ -1,8 +1,8 @@
-"""Devices that check a fencing token, for peers whose locks have one: what zscout's RCs do with a grant.
+"""Devices that check a fencing token, as zscout's RCs check a grant, for peers whose locks have one.
 
 `python -m benchmarks.peers.device` is a child process (see benchmarks/child.py): it reports its port. On each
-connection it takes lines `TOKEN RC...` and answers `ok`, or `old` where one of these RCs was shown a higher token
-already: whoever holds that one is obeyed, and nobody before it."""
+connection it takes lines `TOKEN RC...` and answers `ok`, or `old` if one of these RCs has seen a higher token: it obeys
+only the holder of its highest token."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ async def serve() -> None:
 
 @asynccontextmanager
 async def devices() -> AsyncIterator[str]:
-    """Runs a process for each of HOMES; gives their ports, as one word."""
+    """Run a process for each of HOMES; the target is their ports, separated by commas."""
     processes = [Child.of("peers.device") for _ in HOMES]
     try:
         yield ",".join(str(process.report()) for process in processes)
@@ -50,7 +50,7 @@ async def devices() -> AsyncIterator[str]:
 
 
 class Devices:
-    """A program's links to them."""
+    """A program's links to the devices."""
 
     def __init__(self, links: list[tuple[asyncio.StreamReader, asyncio.StreamWriter]]) -> None:
         self._links = links
@@ -61,12 +61,12 @@ class Devices:
         return cls([await asyncio.open_connection(HOST, int(port)) for port in ports.split(",")])
 
     async def confirm(self, rcs: Sequence[str], token: int) -> None:
-        """Shows `token` to all of `rcs`, one question to each process that has some. Raises PermissionError where it is
+        """Show `token` to all of `rcs`, with one query to each process that has some. Raises PermissionError if it is
         too old."""
         asked = [(number, [rc for rc in rcs if rc in home]) for number, home in enumerate(HOMES)]
         answers = await asyncio.gather(*(self._ask(number, token, own) for number, own in asked if own))
         if not all(answers):
-            raise PermissionError(f"token {token} is older than one that {', '.join(rcs)} were shown")
+            raise PermissionError(f"token {token} is older than the last shown to {', '.join(rcs)}")
 
     async def _ask(self, number: int, token: int, rcs: Sequence[str]) -> bool:
         reader, writer = self._links[number]

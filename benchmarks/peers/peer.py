@@ -1,4 +1,4 @@
-"""What a contender is to this benchmark, and what several of them share."""
+"""The interface of a contender in this benchmark, and code shared by several."""
 
 from __future__ import annotations
 
@@ -16,8 +16,7 @@ from typing import Any
 
 RCS = [f"robot/r{number}" for number in range(10)]
 LEASE = 2
-"""Seconds without word after which a holder counts as dead, for all that know such a thing. The least that
-etcd takes."""
+"""Seconds of silence after which a holder counts as dead, for all contenders with leases; etcd's minimum."""
 START = 30.0
 """Seconds that a server may take to start."""
 END = 15.0
@@ -27,56 +26,56 @@ Waiting = Callable[[], None]
 
 
 class Missing(Exception):
-    """This peer can't be had here; the message says what is missing and how to mend it."""
+    """This peer is not available here; the message names the missing part and its remedy."""
 
 
 class Session(ABC):
-    """One program's link to a peer. Several behaviors use it at once."""
+    """One program's link to a peer, used by several behaviors at once."""
 
     async def prepare(self, rcs: Sequence[str]) -> None:  # noqa: B027
-        """What has to be there before `rcs` can be asked for as a set; not timed."""
+        """Prepare to request `rcs` as a set; not timed."""
 
     async def settle(self, rcs: Sequence[str]) -> None:  # noqa: B027
-        """Waits until what was given back can be had again, where a release returns before; not timed."""
+        """Wait until released `rcs` are available again, if `release` returns sooner; not timed."""
 
     @abstractmethod
     async def acquire(self, rcs: Sequence[str], waiting: Waiting | None) -> Any:
-        """Gets all of `rcs` or waits, and returns the hold. `waiting` is called once it is known to wait."""
+        """Wait for all of `rcs` and return the hold. `waiting` is called as soon as the request is known to wait."""
 
     @abstractmethod
     async def release(self, hold: Any) -> None:
-        """Gives a hold back, and returns when the server has heard it."""
+        """Give a hold back; return once the server has it."""
 
     @abstractmethod
     async def close(self) -> None:
-        """Leaves."""
+        """End the session."""
 
 
 class Peer(ABC):
-    """One contender: its server, which lives in this process's children, and its sessions."""
+    """One contender: its server, which runs in child processes, and its sessions."""
 
     name: str
     lacks: str
-    """What of zscout's work it does not do."""
+    """Features of zscout that it does not have."""
 
     @abstractmethod
     def version(self) -> str:
-        """Versions of server and client. Raises Missing."""
+        """Return the versions of server and client. Raises Missing."""
 
     @abstractmethod
     def serve(self, folder: Path) -> AbstractAsyncContextManager[str]:
-        """Runs the server until the end of the block; gives the address. Raises Missing."""
+        """Run the server until the end of the block; its target is the address. Raises Missing."""
 
     @abstractmethod
     async def connect(self, address: str, name: str) -> Session:
-        """A program's session; `name` is the only one of its kind."""
+        """Open a program's session; `name` is unique."""
 
 
 NAMES = ("zscout", "confirmed", "dask", "redis", "redis_fenced", "etcd", "etcd_fenced", "labgrid", "ray")
 
 
 def load(name: str) -> Peer:
-    """The contender of this name. Raises Missing where its packages are not installed."""
+    """Return the contender of this name. Raises Missing if its packages are not installed."""
     module = "with_zscout" if name == "confirmed" else f"with_{name.partition('_')[0]}"
     try:
         peers: dict[str, Peer] = importlib.import_module(f"benchmarks.peers.{module}").PEERS
@@ -89,12 +88,12 @@ def package(name: str) -> str:
     return f"{name} {importlib.metadata.version(name)}"
 
 
-def program_version(*command: str, mend: str) -> str:
-    """The first line that a program says of its version. Raises Missing."""
+def program_version(*command: str, remedy: str) -> str:
+    """Return the first line that a program prints of its version. Raises Missing, with the remedy `remedy`."""
     try:
         said = subprocess.run(command, capture_output=True, text=True, check=True, timeout=START)
     except (OSError, subprocess.SubprocessError):
-        raise Missing(f"no program {command[0]}; {mend}") from None
+        raise Missing(f"no program {command[0]}; {remedy}") from None
     return said.stdout.splitlines()[0].strip()
 
 
@@ -108,9 +107,9 @@ def free_port() -> int:
 async def server(
     command: Sequence[str], folder: Path, *, port: int | None = None
 ) -> AsyncIterator[subprocess.Popen[bytes]]:
-    """Runs a server in `folder` until the end of the block; with a `port`, waits until it listens there.
+    """Run a server in `folder` until the end of the block; with a `port`, wait until it listens there.
 
-    Raises Missing, with the last line of its log, where it does not come up."""
+    Raises Missing, with the last line of its log, if it does not start."""
     log = folder / f"server-{time.monotonic_ns()}.log"
     process = _started(command, folder, log)
     try:
@@ -141,7 +140,7 @@ async def _listening(process: subprocess.Popen[bytes], port: int, log: Path) -> 
         except OSError:
             if process.poll() is not None or time.monotonic() > deadline:
                 raise Missing(f"its server does not come up: {last_line(log)}") from None
-            # Nobody tells when a port begins to listen.
+            # There is no event for a port that begins to listen.
             await asyncio.sleep(0.05)
         else:
             writer.close()
@@ -154,15 +153,15 @@ def last_line(log: Path) -> str:
 
 
 class Waiters:
-    """Those of a session that wait for RCs, for peers that tell what became free but keep no queue."""
+    """The waiting requests of a session, for peers that notify of freed RCs but keep no queue."""
 
     def __init__(self) -> None:
         self._waiting: dict[asyncio.Event, frozenset[str]] = {}
-        self._deaf = False
+        self._ended = False
 
     @contextmanager
     def waiter(self, rcs: Iterable[str]) -> Iterator[asyncio.Event]:
-        """An event that is set whenever one of `rcs` becomes free. Enter before the first try."""
+        """Return an event that is set whenever one of `rcs` becomes free. Enter before the first try."""
         event = asyncio.Event()
         self._waiting[event] = frozenset(rcs)
         try:
@@ -171,16 +170,17 @@ class Waiters:
             del self._waiting[event]
 
     async def wait(self, event: asyncio.Event) -> None:
-        """Until something became free since the last wait. Raises ConnectionError where none will tell."""
-        if not self._deaf:
+        """Wait until one of the event's RCs has become free since the last wait. Raises ConnectionError if there are no
+        notifications any more."""
+        if not self._ended:
             await event.wait()
         event.clear()
-        if self._deaf:
-            raise ConnectionError("the peer no longer tells what becomes free")
+        if self._ended:
+            raise ConnectionError("the peer's notifications of freed RCs have ended")
 
-    def deaf(self, _task: asyncio.Task[None]) -> None:
-        """To be called when the task that listens has ended."""
-        self._deaf = True
+    def notifications_ended(self, _task: asyncio.Task[None]) -> None:
+        """Call it when the task that receives notifications has ended."""
+        self._ended = True
         for event in self._waiting:
             event.set()
 

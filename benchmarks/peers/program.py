@@ -1,7 +1,7 @@
 """One program of a contender: `python -m benchmarks.peers.program NAME ADDRESS PROGRAM LOG`.
 
-A child process (see benchmarks/child.py): it reports its process id, takes orders as JSON lines, and reports
-times on the clock that all processes of a host share. What the peer's libraries print goes to LOG.
+A child process (see benchmarks/child.py): it reports its process id, takes orders as JSON lines, and reports times on
+the clock that all processes of a host share. Output of the peer's libraries goes to LOG.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ from benchmarks.loop import run
 from benchmarks.peers.peer import START, Session, load
 
 LIMIT = 60.0
-"""Seconds that an order may take beside the time that it names."""
+"""Seconds that an order may take beyond its own `seconds`."""
 END = 5.0
 
 Say = Callable[[Any], None]
 
 
 class Program:
-    """What one program can be told to do."""
+    """Carries out the orders of one program."""
 
     def __init__(self, session: Session, say: Say) -> None:
         self._session, self._say = session, say
@@ -39,7 +39,7 @@ class Program:
             await do(**order)
 
     async def _time(self, rcs: list[str], times: int) -> None:
-        """Reports the seconds of the last of so many acquisitions; the release is not timed."""
+        """Report the seconds of the last of `times` acquisitions; releases are not timed."""
         await self._session.prepare(rcs)
         took = 0.0
         for _ in range(times):
@@ -51,19 +51,19 @@ class Program:
         self._say(took)
 
     async def _hold_on(self, rcs: list[str]) -> None:
-        """Reports once it has them."""
+        """Report once it holds `rcs`."""
         await self._session.prepare(rcs)
         self._hold = await self._session.acquire(rcs, None)
         self._say("holds")
 
     async def _let_go(self) -> None:
-        """Reports when it began to give back."""
+        """Give the hold back; report the time before that."""
         start = time.monotonic()
         await self._session.release(self._hold)
         self._say(start)
 
     async def _wait(self, rcs: list[str], seconds: float) -> None:
-        """Reports that it waits, then when it got them, and gives them back; null if it did not in time."""
+        """Report that it waits, then the time at which it got `rcs`, and give them back; null after `seconds`."""
         await self._session.prepare(rcs)
         try:
             async with asyncio.timeout(seconds):
@@ -75,7 +75,7 @@ class Program:
         await self._session.release(hold)
 
     async def _crowd(self, sets: list[list[str]], seconds: float, hold: float) -> None:
-        """Reports for each behavior when it held its set, as a list of [from, to], and when time was up."""
+        """Report the spans in which each behavior held its set, as lists of [from, to], and the end of the time."""
         for rcs in sets:
             await self._session.prepare(rcs)
         until = time.monotonic() + seconds
@@ -107,7 +107,7 @@ async def program(peer: str, address: str, name: str, say: Say) -> None:
 
 def main() -> None:
     peer, address, name, log = sys.argv[1:]
-    # Libraries print at will; only reports may reach the one who reads them.
+    # Libraries may print; only reports may reach the parent process.
     reports = os.fdopen(os.dup(1), "w", buffering=1)
     with Path(log).open("ab") as out:
         os.dup2(out.fileno(), 1)
@@ -124,7 +124,7 @@ def main() -> None:
         if code:
             traceback.print_exc()
         sys.stderr.flush()
-        # Some peers leave threads that never end.
+        # Some peers' libraries leave threads that never end.
         os._exit(code)
 
 

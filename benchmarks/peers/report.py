@@ -1,4 +1,4 @@
-"""What was measured, and the table of it."""
+"""The measured figures, and their table."""
 
 from __future__ import annotations
 
@@ -6,23 +6,23 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 WORKS = {
-    "one": "grant of 1 RC, nobody else asks (us)",
-    "five": "grant of 5 RCs, nobody else asks (us)",
+    "one": "grant of 1 RC, without contention (us)",
+    "five": "grant of 5 RCs, without contention (us)",
     "next": "from a release to the next waiter's grant, 5 RCs (us)",
     "crowd": "20 behaviors, 10 RCs, 1 to 5 each (grants a second: more is better)",
-    "least": "the same: the behavior served least (share of the mean: more is better)",
+    "least": "the same: the least served behavior (share of the mean: more is better)",
     "killed": "holder killed, to the waiter's grant (s)",
 }
 
 
 @dataclass(frozen=True, slots=True)
 class Figure:
-    """One contender at one kind of work. The ratios compare medians of the same minutes."""
+    """One contender at one kind of work. The ratios compare medians of the same rounds."""
 
     work: str
     who: str
     value: float | None
-    """A median in the unit of `WORKS`; None: it did not happen within the limit, which `note` names."""
+    """A median in the unit of `WORKS`; None if it took longer than the limit in `note`."""
     p99: float | None = None
     to_zscout: float | None = None
     to_bare: float | None = None
@@ -36,7 +36,7 @@ class Report:
     versions: dict[str, str] = field(default_factory=dict)
     lacks: dict[str, str] = field(default_factory=dict)
     missing: dict[str, str] = field(default_factory=dict)
-    """Peers that could not be had or that failed, and why."""
+    """Peers that were not available or failed, and why."""
     machine: dict[str, Any] = field(default_factory=dict)
 
     def as_json(self) -> dict[str, Any]:

@@ -22,12 +22,13 @@ class DaskSession(Session):
         lock = distributed.MultiLock(list(rcs), client=self._client)
         acquired = lock.acquire()
         if waiting is not None:
-            acquired = self._told(acquired, lock.id, waiting)
+            acquired = self._report_waiting(acquired, lock.id, waiting)
         await acquired
         return lock
 
-    async def _told(self, acquired: Any, name: str, waiting: Waiting) -> None:
-        """Dask does not tell who waits: its scheduler is asked until it knows of this one."""
+    async def _report_waiting(self, acquired: Any, name: str, waiting: Waiting) -> None:
+        """Call `waiting` once the scheduler, which is polled, knows the request `name`: Dask does not notify of waiting
+        requests."""
 
         def known(dask_scheduler: Any) -> bool:
             return name in dask_scheduler.extensions["multi_locks"].requests

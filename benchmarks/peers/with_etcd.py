@@ -45,7 +45,7 @@ class EtcdSession(Session):
         self._waiters = Waiters()
         self._watching = asyncio.Event()
         self._task = asyncio.create_task(self._watch())
-        self._task.add_done_callback(self._waiters.deaf)
+        self._task.add_done_callback(self._waiters.notifications_ended)
 
     async def ready(self) -> None:
         async with asyncio.timeout(START):
@@ -86,7 +86,7 @@ class EtcdSession(Session):
 class Etcd(Peer):
     name = "etcd, transactions"
     lacks = (
-        "no queue (whoever tries first after a release wins), no priorities, no preemption; a killed holder "
+        "no queue (the first to try after a release wins), no priorities, no preemption; a killed holder "
         "counts until its lease ends; one member here, which writes every change to disk"
     )
 
@@ -96,7 +96,7 @@ class Etcd(Peer):
             self.name += ", fenced"
 
     def version(self) -> str:
-        said = program_version("etcd", "--version", mend="apt-get install etcd-server")
+        said = program_version("etcd", "--version", remedy="apt-get install etcd-server")
         return f"etcd {said.split(':')[-1].strip()}, {package('etcd3aio')}"
 
     @asynccontextmanager

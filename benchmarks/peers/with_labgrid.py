@@ -28,7 +28,7 @@ def rcs_of(place: str) -> list[str]:
 
 
 class LabgridSession(Session):
-    """Speaks the protocol of labgrid's own client, of which it hears the places only."""
+    """Uses the protocol of labgrid's own client, and subscribes to places only."""
 
     def __init__(self, address: str, name: str) -> None:
         self._channel = grpc.aio.insecure_channel(address)
@@ -37,24 +37,24 @@ class LabgridSession(Session):
         self._waiters = Waiters()
         self._synced = asyncio.Event()
         self._resources: set[str] = set()
-        self._told = asyncio.Event()
-        self._to_say: asyncio.Queue[Any] = asyncio.Queue()
+        self._resources_changed = asyncio.Event()
+        self._outgoing: asyncio.Queue[Any] = asyncio.Queue()
 
     async def start(self, *, resources: bool = False) -> None:
-        """Says hello; with `resources`, hears them too, and waits until all ten are exported."""
+        """Open the stream; with `resources`, subscribe to them too, and wait until all ten are exported."""
         startup = words.StartupDone(version=labgrid_version(), name=self._name)
-        self._to_say.put_nowait(words.ClientInMessage(startup=startup))
-        self._to_say.put_nowait(words.ClientInMessage(subscribe=words.Subscribe(all_places=True)))
+        self._outgoing.put_nowait(words.ClientInMessage(startup=startup))
+        self._outgoing.put_nowait(words.ClientInMessage(subscribe=words.Subscribe(all_places=True)))
         if resources:
-            self._to_say.put_nowait(words.ClientInMessage(subscribe=words.Subscribe(all_resources=True)))
-        self._to_say.put_nowait(words.ClientInMessage(sync=words.Sync(id=1)))
+            self._outgoing.put_nowait(words.ClientInMessage(subscribe=words.Subscribe(all_resources=True)))
+        self._outgoing.put_nowait(words.ClientInMessage(sync=words.Sync(id=1)))
         self._task = asyncio.create_task(self._listen())
-        self._task.add_done_callback(self._waiters.deaf)
+        self._task.add_done_callback(self._waiters.notifications_ended)
         async with asyncio.timeout(START):
             await self._synced.wait()
             while resources and len(self._resources) < len(RCS):
-                self._told.clear()
-                await self._told.wait()
+                self._resources_changed.clear()
+                await self._resources_changed.wait()
 
     async def prepare(self, rcs: Sequence[str]) -> None:
         place = place_of(rcs)
@@ -93,12 +93,12 @@ class LabgridSession(Session):
         await asyncio.gather(self._task, return_exceptions=True)
         await self._channel.close()
 
-    async def _say(self) -> AsyncIterator[Any]:
+    async def _outgoing_messages(self) -> AsyncIterator[Any]:
         while True:
-            yield await self._to_say.get()
+            yield await self._outgoing.get()
 
     async def _listen(self) -> None:
-        async for message in self._stub.ClientStream(self._say()):
+        async for message in self._stub.ClientStream(self._outgoing_messages()):
             if message.HasField("sync"):
                 self._synced.set()
             for update in message.updates:
@@ -107,14 +107,14 @@ class LabgridSession(Session):
                     self._waiters.freed(rcs_of(update.place.name))
                 elif kind == "resource":
                     self._resources.add(update.resource.path.resource_name)
-                    self._told.set()
+                    self._resources_changed.set()
 
 
 class Labgrid(Peer):
     name = "labgrid"
     lacks = (
         "no queue for a set (reservations are for one place), no preemption; a killed client's place stays "
-        "acquired until somebody releases it by hand"
+        "acquired until it is released by hand"
     )
 
     def version(self) -> str:

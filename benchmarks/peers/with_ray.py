@@ -22,7 +22,7 @@ SETTLE = 0.005
 
 class RaySession(Session):
     def __init__(self) -> None:
-        # Its calls block the thread that makes them until the server has answered.
+        # Calls block their thread until the server has answered.
         self._threads = ThreadPoolExecutor(THREADS)
 
     async def acquire(self, rcs: Sequence[str], waiting: Waiting | None) -> Any:
@@ -38,8 +38,8 @@ class RaySession(Session):
         await asyncio.get_running_loop().run_in_executor(self._threads, remove_placement_group, hold)
 
     async def settle(self, rcs: Sequence[str]) -> None:
-        # Its books learn of a removal with the node's next report, and a group asked for before that is tried
-        # again up to a second later. Nothing tells when the books are right.
+        # The server learns of a removal from the node's next report; a group requested before that is retried up to a
+        # second later. There is no event for it.
         while any(ray.available_resources().get(rc, 0) < 1 for rc in rcs):  # noqa: ASYNC110
             await asyncio.sleep(SETTLE)
 
@@ -50,9 +50,9 @@ class RaySession(Session):
 class Ray(Peer):
     name = "Ray placement groups"
     lacks = (
-        "no priorities, no preemption, no order promised among those that wait; its books hear of a release "
-        "0.1 s later, and those that wait are tried again up to a second after that; what a group holds is "
-        "a number in these books, which no device checks"
+        "no priorities, no preemption, no promised order among waiting groups; the server learns of a release "
+        "0.1 s later, and retries waiting groups up to a second after that; a group holds a number at the "
+        "server, which no device checks"
     )
 
     def version(self) -> str:

@@ -1,5 +1,5 @@
-"""Redis: one Lua script takes all keys or none; what is released is published, and waiters try again. With fencing, the
-script counts a token as well, and each device is shown it before the hold counts."""
+"""Redis: one Lua script takes all keys or none; releases are published, and waiters try again. With fencing, the script
+also counts a token, which is shown to each device before the hold counts."""
 
 from __future__ import annotations
 
@@ -35,8 +35,8 @@ if longest ~= -2 then return {longest, 0} end
 for _, key in ipairs(KEYS) do redis.call('SET', key, ARGV[1], 'PX', ARGV[2]) end
 return {-2, redis.call('INCR', 'fence')}
 """
-"""-2 where all were taken, or after how many ms the last of those that are in the way ends unless renewed; and the
-token of this hold, above those of all before it."""
+"""Returns -2 if all were taken, else the ms until the last conflicting key ends unless renewed; and the token of this
+hold, above all earlier tokens."""
 RENEW = """
 for _, key in ipairs(KEYS) do
   if redis.call('GET', key) == ARGV[1] then redis.call('PEXPIRE', key, ARGV[2]) end
@@ -63,7 +63,7 @@ class RedisSession(Session):
         self._waiters = Waiters()
         self._held: dict[str, Held] = {}
         self._tasks = [asyncio.create_task(self._listen()), asyncio.create_task(self._keep())]
-        self._tasks[0].add_done_callback(self._waiters.deaf)
+        self._tasks[0].add_done_callback(self._waiters.notifications_ended)
 
     async def acquire(self, rcs: Sequence[str], waiting: Waiting | None) -> Held:
         held = Held(uuid.uuid4().hex, list(rcs))
@@ -109,7 +109,7 @@ class RedisSession(Session):
 class Redis(Peer):
     name = "Redis, Lua script"
     lacks = (
-        "no queue (whoever tries first after a release wins), no priorities, no preemption; a killed holder "
+        "no queue (the first to try after a release wins), no priorities, no preemption; a killed holder "
         "counts until its keys end; nothing is written to disk, and no device checks a hold"
     )
 
@@ -120,8 +120,8 @@ class Redis(Peer):
             self.lacks = self.lacks.replace(", and no device checks a hold", "")
 
     def version(self) -> str:
-        mend = "apt-get install redis-server"
-        said = program_version("redis-server", "--version", mend=mend).split("v=")[1].split()[0]
+        remedy = "apt-get install redis-server"
+        said = program_version("redis-server", "--version", remedy=remedy).split("v=")[1].split()[0]
         return f"redis-server {said}, {package('redis')}"
 
     @asynccontextmanager

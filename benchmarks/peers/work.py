@@ -1,4 +1,4 @@
-"""The work: a contender's programs, what they are told to do, zscout's turn by turn with a peer's."""
+"""The work: a contender's programs and their orders, zscout's in turn with a peer's."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ BEHAVIORS = 20
 MOST = 5
 SEED = 2002
 HOT = 3
-"""Times that each thing is done in a row, of which the last counts: as in benchmarks/latency.py."""
+"""Consecutive runs of each measurement, of which the last counts: as in benchmarks/latency.py."""
 LEAST_ROUNDS = 5
 WARM_UP = 10
-"""The part of rounds, or of seconds, that only warms up."""
+"""One part in WARM_UP of the rounds, or of the seconds, is the warm-up."""
 SLOW = 0.25
-"""Seconds from which on it no longer matters how warm the caches are: once in a row is enough."""
+"""Seconds above which warm caches don't matter: a single run is enough."""
 CHECK = 1.0
 CHECK_HOLD = 0.005
-"""The crowd's first round is not counted: each keeps what it got for so many seconds, so that it would show
-if two held the same. In the rounds that count it is given back at once."""
+"""The crowd's first round, of CHECK seconds, only checks for double holds: each behavior keeps its RCs for CHECK_HOLD
+seconds. In the rounds that count, it gives them back at once."""
 KILLS = 3
 NEVER = 15.0
 """Seconds after which a killed holder's RCs count as never freed."""
@@ -42,7 +42,7 @@ Progress = Callable[[str], None]
 
 
 class DoubleBooked(Exception):
-    """Two behaviors held one RC at once: what was measured is no lock."""
+    """Two behaviors held one RC at once: the contender is no lock."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,7 +99,7 @@ def uncontended(team: Team, rcs: list[str]) -> float:
 
 
 def next_waiter(team: Team, rcs: list[str]) -> float:
-    """Seconds from one program's release to the grant that another one sees."""
+    """Return the seconds from one program's release to another program's grant."""
     holder, waiter = team.programs[:2]
     took = 0.0
     for _ in range(HOT):
@@ -119,7 +119,7 @@ def next_waiter(team: Team, rcs: list[str]) -> float:
 def latencies(
     home: Team, away: Team, bare: BareQuery, rounds: int, seconds: float, progress: Progress
 ) -> dict[str, Taken]:
-    """zscout (`home`), a peer (`away`) and the bare query in turn, for so many rounds or seconds."""
+    """Measure zscout (`home`), a peer (`away`) and the bare query in turn, for `rounds`, or at most `seconds`."""
     measures: dict[str, Callable[[Team], float]] = {
         "one": lambda team: uncontended(team, RCS[:1]),
         "five": lambda team: uncontended(team, RCS[:5]),
@@ -146,14 +146,14 @@ def latencies(
 
 
 def sets() -> list[list[str]]:
-    """What each behavior needs: the same for every contender and in every round."""
+    """Return the RCs that each behavior needs: the same for every contender and in every round."""
     rng = random.Random(SEED)  # noqa: S311
     return [rng.sample(RCS, rng.randint(1, MOST)) for _ in range(BEHAVIORS)]
 
 
 @dataclass(slots=True)
 class Crowd:
-    """Grants a second, round by round, and how often each behavior was served."""
+    """Grants per second in each round, and the number of grants of each behavior."""
 
     rates: list[float]
     served: list[int]
@@ -168,7 +168,7 @@ class Crowd:
 
 
 def crowds(teams: list[Team], rounds: int, seconds: float) -> list[Crowd]:
-    """The teams in turn; each is first checked for being a lock at all. Raises DoubleBooked."""
+    """Run the teams in turn, each after a check for double holds. Raises DoubleBooked."""
     found = [Crowd([], [0] * BEHAVIORS) for _ in teams]
     for number in range(-1, rounds):
         for team, crowd in zip(teams, found, strict=True):
@@ -180,7 +180,7 @@ def crowds(teams: list[Team], rounds: int, seconds: float) -> list[Crowd]:
 
 
 def _crowd(team: Team, seconds: float, hold: float) -> list[int]:
-    """Grants of each behavior; it keeps what it got for `hold` seconds."""
+    """Return the number of grants of each behavior, which keeps its RCs for `hold` seconds."""
     needs = sets()
     share = BEHAVIORS // PROGRAMS
     for number, program in enumerate(team.programs):
@@ -193,12 +193,12 @@ def _crowd(team: Team, seconds: float, hold: float) -> list[int]:
         for (_, end), (start, _) in itertools.pairwise(spans):
             if start < end:
                 raise DoubleBooked(f"{rc} was held twice at once")
-    # Who still waited when time was up got a turn as well, which does not count.
+    # Grants after the end of the time don't count.
     return [sum(start < report["until"] for start, _ in spans) for report in reports for spans in report["held"]]
 
 
 def killed(team: Team, progress: Progress) -> Figure:
-    """Seconds from a holder's death to the grant of one that waits; `who` is left to the caller."""
+    """Measure the seconds from a holder's death to the waiter's grant; the caller sets `who`."""
     rcs, waiter = RCS[:5], team.programs[1]
     took: list[float] = []
     for number in range(KILLS):
