@@ -105,7 +105,7 @@ def believed(rcm: Rcm) -> str:
     status, authority, of_forger = rcm.core.status(), rcm.leader.admission.authority, 0
     for arc in (*status.running, *status.queued):
         host, request = arc.request.client.partition("/")[0], arc.request
-        most = authority.highest(host)
+        most = authority.highest_priority(host)
         if most is not None and arc.request.priority > most:
             return f"{arc.id} has priority {arc.request.priority}, above its role"
         if request.who is not None and request.who.user == FORGED.user:

@@ -284,7 +284,7 @@ GUARDS: Final[Mapping[str, Guard]] = MappingProxyType(
         ),
         "door": Guard("what clients list passes the door of what they ask for", {(Admission, "check"): _nothing}),
         "clamped": Guard("what RCs report is no more than its client may ask for", {(Admission, "clamped"): _as_told}),
-        "certified": Guard("who asks has the name of its certificate", {(Authority, "known_as"): _as_it_says}),
+        "certified": Guard("who asks has the name of its certificate", {(Authority, "certified_who"): _as_it_says}),
         "managers": Guard("records of bookings come from managers only", {(Authority, "may_lead"): _yes}),
         "sealed": Guard("a place is had by whom it was given to", {(Places, "may_claim"): _yes}),
         "instances": Guard(

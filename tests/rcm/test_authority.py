@@ -198,8 +198,8 @@ def test_a_client_is_protected_for_a_day_at_most_unless_the_file_says_more(
     tmp_path: Path, ceiling: str, name: str, longest: int
 ) -> None:
     text = FILE.replace("[ceilings.client]\nruntime = 60", ceiling)
-    assert authority(tmp_path, text).longest(name) == longest * SECOND
-    assert authority(tmp_path, text.replace('[security]\nfolder = "keys"', "")).longest(name) == 0
+    assert authority(tmp_path, text).longest_runtime(name) == longest * SECOND
+    assert authority(tmp_path, text.replace('[security]\nfolder = "keys"', "")).longest_runtime(name) == 0
 
 
 def test_a_component_counts_against_the_quotas_of_its_starter(tmp_path: Path) -> None:

@@ -53,8 +53,8 @@ from zscout.messages import (
 from zscout.rcm import steps
 from zscout.rcm.admission import Admission
 from zscout.rcm.authority import Authority
+from zscout.rcm.device_check import DeviceCheck
 from zscout.rcm.devices import ExpectedDevices
-from zscout.rcm.door import Door
 from zscout.rcm.leader import Leader
 from zscout.rcm.places import Places
 from zscout.rcm.recovery import take_over
@@ -129,8 +129,8 @@ class LeaderPlayer:
         core = Core(STRATEGIES["adaptive"](), self.authority.bound(fleet.scheduling))
         self.admission = Admission(self.authority, Places("lab", None, OWN))
         roster = Roster(keys, "leader", fleet, OWN, ExpectedDevices({}), self.admission, core.arc, self.now)
-        door = Door(ExpectedDevices({}), roster, 0)
-        self.keys, self.leader = keys, Leader(fleet, core, self.admission, roster, door, NoBookings(), None)
+        device_check = DeviceCheck(ExpectedDevices({}), roster, 0)
+        self.keys, self.leader = keys, Leader(fleet, core, self.admission, roster, device_check, NoBookings(), None)
 
     def batch(self, line: str) -> list[str]:
         stimuli = list[steps.Stimulus]()

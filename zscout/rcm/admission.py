@@ -125,7 +125,7 @@ class Admission:
                 label=asked.arc,
                 direct=more is not None and more.direct,
                 continues="" if more is None else more.continues,
-                who=None if more is None else self.authority.known_as(sender, more.who),
+                who=None if more is None else self.authority.certified_who(sender, more.who),
                 charged_to=self.authority.starter(client),
             )
         except (BadName, ValueError) as error:
@@ -243,7 +243,7 @@ class Admission:
     def clamped(self, request: ArcRequest) -> ArcRequest:
         """The request of a hold, cut down to what its client may ask for now."""
         host = request.client.partition("/")[0]
-        most, longest = self.authority.highest(host), self.authority.longest(host)
+        most, longest = self.authority.highest_priority(host), self.authority.longest_runtime(host)
         most = MAX_PRIORITY if most is None else most
         priority = max(-MAX_PRIORITY, min(request.priority, most))
         if longest and request.min_runtime > longest:

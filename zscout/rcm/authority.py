@@ -1,7 +1,7 @@
-"""What a sender's role allows beyond what its keys tell: checked by whoever answers it. Pure.
+"""The rights of a sender's role that keys alone don't enforce: checked before its query is answered. Pure.
 
-Access control holds the `<host>` in a sender's keys to its certificate, so that name is all that is looked up. On a
-plain mesh nothing proves a name, and nothing is refused here."""
+Access control ties the `<host>` in a sender's keys to its certificate, so rights are looked up by that name alone. On
+a plain mesh nothing proves a name, and nothing is refused here."""
 
 from __future__ import annotations
 
@@ -32,25 +32,25 @@ OPERATORS: Final[frozenset[Rank]] = frozenset({"operator"})
 
 
 class Authority:
-    """The rights of all names and the limits, as the fleet file has them at present."""
+    """The rights of all names, and the limits, by the fleet file as it was read last."""
 
     def __init__(self, fleet: Fleet) -> None:
         self._policy, self.enforced = fleet.access, fleet.security is not None
         self.limits = fleet.limits
         self._operator_priority = fleet.operator_priority
         self.placed: Mapping[ComponentId, Placement] = {}
-        """The components as the placer published them."""
+        """The components that the placer published last."""
 
     def reload(self, fleet: Fleet) -> None:
         """Take the rights and limits of a fleet file that was read again."""
         self._policy, self.limits = fleet.access, fleet.limits
 
     def bound(self, policy: SchedulingPolicy) -> SchedulingPolicy:
-        """Return the policy with the rights and limits that the scheduler enforces. A name in several groups counts in
-        the first."""
+        """Return the policy with the rights and limits that the scheduler enforces. A name in several groups belongs
+        to the first."""
         policy = self.limits.bound(policy)
         if policy.fair_shares is not None:
-            # Backwards, so that the first group of a name stands last.
+            # Reversed, so that the first group of a name overwrites the others.
             listed = reversed([*self._policy.groups.items()])
             groups = {name: group for group, members in listed for name in members}
             policy = replace(policy, fair_shares=replace(policy.fair_shares, groups=groups))
@@ -72,11 +72,11 @@ class Authority:
         )
 
     def check_ask(self, name: str, asked: ArcRequest, open_by: Callable[[Collection[str]], int]) -> None:
-        """Raises Refused for what `name` may not ask for. `open_by`: how many ARCs some names have open."""
+        """Raises Refused if `name` may not make this request. `open_by`: counts the open ARCs of some names."""
         if not self.enforced:
             return
         self._check_rank(name, "request devices", USERS)
-        most, longest = self.highest(name), self.longest(name)
+        most, longest = self.highest_priority(name), self.longest_runtime(name)
         if most is not None and asked.priority > most:
             raise self._refused(name, f"request priority {asked.priority}; at most {most}")
         if longest and asked.min_runtime > longest:
@@ -95,8 +95,8 @@ class Authority:
             if quota.arcs is not None and open_by(members) >= quota.arcs:
                 raise Refused("not_allowed", f"{owner} has {quota.arcs} open requests, its quota; cancel one")
 
-    def highest(self, name: str) -> int | None:
-        """The highest priority that this name may ask for; None: any."""
+    def highest_priority(self, name: str) -> int | None:
+        """The highest priority that this name may request; None: any."""
         if not self.enforced:
             return None
         most = self._policy.ceiling(name).priority
@@ -105,13 +105,13 @@ class Authority:
         below = self._operator_priority - 1
         return below if most is None else min(below, most)
 
-    def longest(self, name: str) -> Ns:
-        """The longest minimum runtime that this name may ask for; 0: any."""
+    def longest_runtime(self, name: str) -> Ns:
+        """The longest minimum runtime that this name may request; 0: any."""
         return (self._policy.ceiling(name).runtime or 0) if self.enforced else 0
 
     def starter(self, client: ClientId) -> str:
-        """Whose quotas a component's requests count against, which is on its starter's behalf where the placer has put
-        it; empty: its own."""
+        """The name whose quotas count a component's requests: it acts for whoever started it, on the host that the
+        placer chose. Empty: its own host's."""
         host, _, name = client.partition("/")
         placement = self.placed.get(name.rpartition(".")[0]) if self.enforced else None
         if placement is None or host not in (placement.host, placement.to):
@@ -121,8 +121,8 @@ class Authority:
     def may_lead(self, host: HostName) -> bool:
         return not self.enforced or "manager" in self._policy.ranks_of(host)
 
-    def known_as(self, sender: Sender, who: Who | None) -> Who | None:
-        """Who asks, as people are told it: whoever it says to be, its user is the one that its certificate names."""
+    def certified_who(self, sender: Sender, who: Who | None) -> Who | None:
+        """Return `who` with the user of the sender's certificate, in place of the user that it claims to be."""
         return structs.replace(who, user=sender.host) if who is not None and self.enforced else who
 
     def check_hand_over(
@@ -133,8 +133,8 @@ class Authority:
         open_by: Callable[[Collection[str]], int],
         held_by: Callable[[Collection[str]], int],
     ) -> None:
-        """Raises Refused where the new client may not have what it is given. `open_by`, `held_by`: how many ARCs some
-        names have open, and how many RCs they hold."""
+        """Raises Refused if the new client may not have these ARCs. `open_by`, `held_by`: count the open ARCs of some
+        names, and the RCs that they hold."""
         if not self.enforced:
             return
         self._check_rank(to.host, "take over a request", USERS)
@@ -144,7 +144,7 @@ class Authority:
         running = sum(len(arc.needs) for arc in arcs if arc.hold is not None)
         for owner, members, quota in self._policy.quotas_of(self.starter(str(to)) or to.host):
             if (self.starter(str(sender)) or sender.host) in members:
-                continue  # it has no more than before
+                continue  # the quota counts these ARCs already
             if quota.arcs is not None and open_by(members) + len(arcs) > quota.arcs:
                 words = f"{owner} may have {quota.arcs} open requests, and would have more; cancel some first"
                 raise Refused("not_allowed", words)
@@ -153,18 +153,18 @@ class Authority:
                 raise Refused("not_allowed", words)
 
     def check_operator(self, sender: Sender, what: str) -> None:
-        """Raises Refused for all but operators. `what` stands behind `may not`."""
+        """Raises Refused for all but operators. `what` follows `may not` in the refusal."""
         if self.enforced:
             self._check_rank(sender.host, what, OPERATORS)
 
     def check_user(self, sender: Sender, what: str) -> None:
-        """Raises Refused for who may only look."""
+        """Raises Refused for senders that may only view."""
         if self.enforced:
             self._check_rank(sender.host, what, USERS)
 
     def check_component(self, sender: Sender, operation: ComponentOperation) -> None:
-        """Raises Refused for who may not have a node do this: start and move are the placer's, stop is an operator's
-        as well, and a component that moves may give its next incarnation what it has."""
+        """Raises Refused if `sender` may not order this of a node: the placer starts and moves, operators may stop as
+        well, and a component that moves may hand its state to its next incarnation."""
         if not self.enforced or isinstance(operation, ListComponents | ReadOutput):
             return
         name, _, number = sender.client.rpartition(".")
@@ -184,13 +184,13 @@ class Authority:
         return holders is None or name in holders
 
     def _barred(self, name: str) -> tuple[str, ...]:
-        """The patterns of RCs that may not be had by this name."""
+        """The patterns of RCs that this name may not hold."""
         allowed = {name, *self._policy.groups_of(name)}
         barred = (pattern for pattern, names in self._policy.access.items() if not allowed & {*names})
         return tuple(map(as_pattern, barred))
 
     def is_removed(self, client: ClientId) -> bool:
-        """Whether this client's name has no role any more that lets it hold anything."""
+        """Return True if this client's name no longer has a role that may hold RCs."""
         ranks = self._policy.ranks_of(client.partition("/")[0])
         return self.enforced and not ranks & USERS
 
@@ -199,6 +199,6 @@ class Authority:
             raise Refused("not_allowed", why)
 
     def _refused(self, name: str, what: str) -> Refused:
-        """Of what operators may."""
-        could = [one for one, ranks in self._policy.ranks.items() if "operator" in ranks]
-        return Refused("not_allowed", self._policy.refusal_text(name, what, could))
+        """The refusal of something that operators may do."""
+        operators = [operator for operator, ranks in self._policy.ranks.items() if "operator" in ranks]
+        return Refused("not_allowed", self._policy.refusal_text(name, what, operators))

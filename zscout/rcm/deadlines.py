@@ -1,4 +1,4 @@
-"""Deadlines of a pure state machine: set with a value, due by the time that is passed in."""
+"""Deadlines of a pure state machine: each is set with a value, and is due at the time that the caller passes in."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ T = TypeVar("T")
 
 
 class Deadlines(Generic[T]):
-    """A value whose reason is gone is ignored when it is due: nothing is cancelled."""
+    """Nothing is cancelled: the caller ignores a due value that no longer matters."""
 
     def __init__(self) -> None:
         self._heap: list[tuple[Ns, int, T]] = []
@@ -22,7 +22,7 @@ class Deadlines(Generic[T]):
         heapq.heappush(self._heap, (at, next(self._order), value))
 
     def pop_due(self, now: Ns) -> T | None:
-        """The next value that is due; None: none is."""
+        """Remove and return the earliest due value; None: nothing is due."""
         return heapq.heappop(self._heap)[2] if self._heap and self._heap[0][0] <= now else None
 
     @property

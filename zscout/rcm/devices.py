@@ -1,6 +1,6 @@
-"""Which devices a fleet expects: those that its file names, and those that were seen within a day. Pure.
+"""The devices that a fleet expects: devices in its fleet file, and devices seen within the last day. Pure.
 
-An RC has a *home* at each host that offers it, or did so. One that goes is remembered with when, and why."""
+An RC has a *home* at each host that offers or offered it. When an RC disappears, its home keeps the time and reason."""
 
 from __future__ import annotations
 
@@ -19,7 +19,8 @@ MAX_HOMES: Final = 20_000
 
 
 class SeenHome(msgspec.Struct, frozen=True, omit_defaults=True):
-    """That an RC was seen at a host, `ago` seconds before this was said. `why` it went, if that is known."""
+    """An RC was seen at a host `ago` seconds before this record was written. `why`: the reason that it disappeared, if
+    known."""
 
     rc: str
     host: str
@@ -31,7 +32,7 @@ class SeenHome(msgspec.Struct, frozen=True, omit_defaults=True):
 
 
 def homes_in(views: Iterable[RcView]) -> Iterator[SeenHome]:
-    """What a leader's list of devices says."""
+    """The homes in a leader's list of devices."""
     for view in views:
         seen = dict.fromkeys(view.duplicates, 0.0) | view.unseen
         if view.host and (view.present or view.gone is not None):
@@ -47,13 +48,13 @@ class Home:
 
     declared: bool = False
     instances: set[str] = field(default_factory=set)
-    """Those that live."""
+    """Instances whose tokens are seen."""
     seen: Ns | None = None
-    """When the last of them went; None: there was none yet, or one lives."""
+    """When the last instance disappeared; None: there was none yet, or one is seen."""
     why: str = ""
-    """Why it went, if that is known better than that it did."""
+    """The reported reason that it disappeared, if any."""
     stopped: bool = False
-    """It left in order."""
+    """The RC was shut down in order."""
 
 
 @dataclass(slots=True)
@@ -61,25 +62,25 @@ class _Device:
     homes: dict[HostName, Home] = field(default_factory=dict)
     sharable: bool = False
     parameters: Parameters | None = None
-    """As it said last."""
+    """Of its last report."""
 
 
 class ExpectedDevices:
-    """What one host knows of the devices of its fleet. Times are its own clock's."""
+    """One host's knowledge of its fleet's devices. Times are by its own monotonic clock."""
 
     def __init__(self, declared: Mapping[HostName, Collection[RcName]]) -> None:
         self._devices: dict[RcName, _Device] = {}
         self._living: dict[HostName, set[Token]] = {}
         self._count = 0
-        """Homes of all devices."""
+        """The number of homes of all devices."""
         self.version = 0
-        """Grows with whatever is worth remembering."""
+        """Grows with each change that should be stored."""
         self.declare(declared)
 
     # In
 
     def declare(self, declared: Mapping[HostName, Collection[RcName]]) -> None:
-        """Expect the devices of a fleet file, in place of those of the last one."""
+        """Expect the devices of this fleet file instead of the last file's."""
         for device in self._devices.values():
             for home in device.homes.values():
                 home.declared = False
@@ -89,7 +90,7 @@ class ExpectedDevices:
                     expected.declared = True
         self.version += 1
 
-    def came(self, token: Token) -> None:
+    def token_came(self, token: Token) -> None:
         home = self._home(token.name, token.host)
         if home is not None:
             home.instances.add(token.instance)
@@ -97,7 +98,7 @@ class ExpectedDevices:
             self._living.setdefault(token.host, set()).add(token)
             self.version += 1
 
-    def went(self, token: Token, now: Ns) -> None:
+    def token_went(self, token: Token, now: Ns) -> None:
         if living := self._living.get(token.host):
             living.discard(token)
             if not living:
@@ -109,20 +110,20 @@ class ExpectedDevices:
                 home.seen = now
                 self.version += 1
 
-    def said(self, state: RcState) -> None:
-        """What an RC reports of itself."""
+    def report(self, state: RcState) -> None:
+        """Take over an RC's own report."""
         if _is_name(state.rc, state.host) and self._home(state.rc, state.host) is not None:
             device = self._devices[state.rc]
             device.sharable, device.parameters = state.sharable, state.parameters
 
     def stopped(self, rc: RcName, host: HostName) -> None:
-        """Its last word: it left in order."""
+        """An RC reports that it was shut down in order."""
         if _is_name(rc, host) and (home := self._home(rc, host)) is not None:
             home.why, home.stopped = f"it is stopped at {host}", True
             self.version += 1
 
-    def lost_sight(self, now: Ns) -> None:
-        """No token is followed any more."""
+    def forget_tokens(self, now: Ns) -> None:
+        """Tokens are no longer followed: no instance counts as seen."""
         for device in self._devices.values():
             for home in device.homes.values():
                 if home.instances:
@@ -131,22 +132,23 @@ class ExpectedDevices:
         self._living.clear()
 
     def remember(self, homes: Iterable[SeenHome], now: Ns) -> None:
-        """What another host knows, or this one knew before it started anew. What is seen here is known better."""
-        for told in homes:
-            seen = now - round(told.ago * SECOND)
-            if now - seen > REMEMBERED or not _is_name(told.rc, told.host):
+        """Take over homes that another host knows, or that this host stored before it restarted. They replace nothing
+        that was seen here later."""
+        for stored in homes:
+            seen = now - round(stored.ago * SECOND)
+            if now - seen > REMEMBERED or not _is_name(stored.rc, stored.host):
                 continue
-            home = self._home(told.rc, told.host)
+            home = self._home(stored.rc, stored.host)
             if home is None or home.instances or (home.seen is not None and home.seen >= seen):
                 continue
-            home.seen, home.why, home.stopped = seen, told.why, told.stopped
+            home.seen, home.why, home.stopped = seen, stored.why, stored.stopped
             self.version += 1
-            device = self._devices[told.rc]
+            device = self._devices[stored.rc]
             if device.parameters is None:
-                device.sharable, device.parameters = told.sharable, told.parameters
+                device.sharable, device.parameters = stored.sharable, stored.parameters
 
     def _home(self, rc: RcName, host: HostName) -> Home | None:
-        """Made known where it was not; None: there are too many."""
+        """The home of `rc` at `host`, added if new; None: there are MAX_HOMES already."""
         device = self._devices.get(rc)
         home = device.homes.get(host) if device is not None else None
         if home is None and self._count < MAX_HOMES:
@@ -156,11 +158,12 @@ class ExpectedDevices:
         return home
 
     def forget_old(self, now: Ns) -> None:
-        """What nobody expects any more."""
+        """Remove homes that are no longer expected: not in the fleet file, and unseen for a day, or shut down while the
+        RC is seen at another host."""
         for rc, device in list(self._devices.items()):
             for host, home in list(device.homes.items()):
                 old = home.seen is None or now - home.seen > REMEMBERED
-                moved = home.stopped and any(one.instances for one in device.homes.values())
+                moved = home.stopped and any(other.instances for other in device.homes.values())
                 if not home.instances and not home.declared and (old or moved):
                     del device.homes[host]
                     self._count -= 1
@@ -170,7 +173,7 @@ class ExpectedDevices:
     # Out
 
     def homes(self, now: Ns) -> list[SeenHome]:
-        """All that were seen, to be remembered."""
+        """All homes where an RC is or was seen, for storing."""
         return [
             SeenHome(rc, host, _ago(home, now), home.why, home.stopped, device.sharable, device.parameters)
             for rc, device in sorted(self._devices.items())
@@ -180,13 +183,13 @@ class ExpectedDevices:
 
     @property
     def names(self) -> KeysView[RcName]:
-        """All RCs that are there or expected."""
+        """All RCs that are seen or expected."""
         return self._devices.keys()
 
     def latest_home(self, rc: RcName) -> HostName | None:
-        """Where it was seen last; else where it should be."""
-        gone = self._devices[rc].homes if rc in self._devices else {}
-        return min(gone, key=lambda one: (gone[one].seen is None, -(gone[one].seen or 0), one), default=None)
+        """The host where `rc` was seen last; else a host where the fleet file has it."""
+        homes = self._devices[rc].homes if rc in self._devices else {}
+        return min(homes, key=lambda host: (homes[host].seen is None, -(homes[host].seen or 0), host), default=None)
 
     def home_of(self, rc: RcName) -> HostName | None:
         """The host at which the fleet file has it."""
@@ -199,7 +202,7 @@ class ExpectedDevices:
         return device.parameters if device is not None else None
 
     def why_gone(self, rc: RcName, host: HostName) -> str:
-        """Why no instance of it is at `host`, in words."""
+        """The reason that no instance of `rc` is at `host`, as text for people."""
         home = self._devices[rc].homes.get(host) if rc in self._devices else None
         if home is not None and home.why:
             return home.why
@@ -208,8 +211,8 @@ class ExpectedDevices:
         return f"it is gone from {host}" if host in self._living else f"the node of {host} is gone"
 
     def view(self, known: RcView, now: Ns, named: HostName | None) -> RcView:
-        """An RC as people see it. `known` is what scheduling and the RC itself say of it, and `named` the host of the
-        instance that is meant."""
+        """The RC for `status` and the web page. `known`: its state by the scheduler and its own report; `named`: the
+        host of its named instance."""
         device = self._devices.get(known.rc, _Device())
         living = sorted(host for host, home in device.homes.items() if home.instances)
         gone = {host: home for host, home in device.homes.items() if not home.instances}
@@ -223,9 +226,9 @@ class ExpectedDevices:
         if host in gone and not known.present:
             reason, since = self.why_gone(known.rc, host), None if gone[host].seen is None else _ago(gone[host], now)
         unseen = {
-            one: _ago(home, now)
-            for one, home in sorted(gone.items())
-            if one != host and home.seen is not None and not home.stopped
+            other: _ago(home, now)
+            for other, home in sorted(gone.items())
+            if other != host and home.seen is not None and not home.stopped
         }
         return RcView(
             known.rc,
@@ -235,14 +238,14 @@ class ExpectedDevices:
             host=host,
             reason="" if known.present else reason,
             gone=since,
-            duplicates=[one for one in living if one != host],
+            duplicates=[other for other in living if other != host],
             unseen=unseen,
             parameters=known.parameters if known.parameters is not None else device.parameters,
         )
 
 
 def _ago(home: Home, now: Ns) -> float:
-    """Seconds since it was seen."""
+    """Seconds since an instance was seen there."""
     return 0.0 if home.instances or home.seen is None else max(0, now - home.seen) / SECOND
 
 

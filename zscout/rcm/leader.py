@@ -20,7 +20,7 @@ from zscout.messages import Refused
 from zscout.rcm import steps
 from zscout.rcm.admission import Admission
 from zscout.rcm.booked import FleetBookings
-from zscout.rcm.door import Door
+from zscout.rcm.device_check import DeviceCheck
 from zscout.rcm.operations import Operations
 from zscout.rcm.places import request_id
 from zscout.rcm.recovery import RecoveredState, listed_by, removed, vouched
@@ -64,14 +64,14 @@ class Leader:
         core: Core,
         admission: Admission,
         roster: Roster,
-        door: Door,
+        device_check: DeviceCheck,
         bookings: FleetBookings,
         runtimes: RuntimeEstimator | None,
     ) -> None:
         self._fleet, self.core, self.admission, self.roster = fleet, core, admission, roster
         self._bookings, self.term = bookings, admission.places.term
         self.registry = RequestLog(core, roster, admission.places, runtimes)
-        self.operations = Operations(fleet, core, self.registry, roster, admission, door, bookings, runtimes)
+        self.operations = Operations(fleet, core, self.registry, roster, admission, device_check, bookings, runtimes)
         self._parts = roster, self.registry, self.operations, bookings
         """All that has deadlines."""
         self.seq = 0
@@ -246,7 +246,7 @@ class Leader:
         for arc in self.core.arcs():
             self._bind(arc)
             if (expecting := recovered.expected.get(request_id(arc))) is not None:
-                places.admit(arc, expecting)
+                places.allow_claims(arc, expecting)
 
     def _compare(self, state: messages.RcState) -> list[model.Event]:
         """Makes an RC and the core agree: what the RC lost has ended, what is too much there is revoked."""

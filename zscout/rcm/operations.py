@@ -18,7 +18,7 @@ from zscout.messages import Ask, Cancel, Foresee, Foresight, HandOver, Notice, P
 from zscout.rcm.admission import Admission
 from zscout.rcm.booked import FleetBookings
 from zscout.rcm.deadlines import Deadlines
-from zscout.rcm.door import Door
+from zscout.rcm.device_check import DeviceCheck
 from zscout.rcm.places import arc_id, request_id
 from zscout.rcm.recovery import Listed, vouched
 from zscout.rcm.request_log import RequestLog, party_info, reason_info
@@ -78,11 +78,11 @@ class Operations:
         registry: RequestLog,
         roster: Roster,
         admission: Admission,
-        door: Door,
+        device_check: DeviceCheck,
         bookings: FleetBookings,
         runtimes: RuntimeEstimator | None,
     ) -> None:
-        self.core, self._registry, self._roster, self._door = core, registry, roster, door
+        self.core, self._registry, self._roster, self._device_check = core, registry, roster, device_check
         self._admission, self._bookings, self._runtimes = admission, bookings, runtimes
         self._first_answer: Ns = fleet.timing.vote_timeout + REPLY_SLACK
         self._lease: Ns = round(fleet.mesh.lease * SECOND)
@@ -281,7 +281,7 @@ class Operations:
         if ask.place is not None and (place := self._own_place(ask, client)) is not None:
             since = self._now - round(ask.waited * SECOND)
         elif ask.check and ask.place is None and ask.grant is None:
-            self._door.check(self._now, ask.needs, waits=ask.wait_for_device)
+            self._device_check.check(self._now, ask.needs, waits=ask.wait_for_device)
         self._registry.enter(arc, ask.arc, estimate=ask.estimate)
         instant.touched.add(arc)
         instant.asked.append(model.Requested(request, place, since))
@@ -304,7 +304,7 @@ class Operations:
         self._admission.check_place(ask.place, self.core.could_have_issued)
         seen = client in self._roster.clients
         if places.may_claim(ask.place, client, ask.was or ask.id, ask.seal, seen=seen):
-            if places.takes_the_word_for(ask.place):
+            if places.is_unproven(ask.place):
                 text = f"{client} shows a place of term {ask.place.term.counter} that is not known here: it has it"
                 self._out.strange.append((client, text))
             return ask.place
@@ -357,7 +357,7 @@ class Operations:
                 outcome = model.Outcome.CANCELLED if isinstance(operation, Cancel) else model.Outcome.RELEASED
                 self._registry.give_up(self._now, arc, outcome)
         event = model.Cancelled if isinstance(operation, Cancel) else model.Released
-        by = "" if owner == sender else person(authority.known_as(sender, operation.who), str(sender))
+        by = "" if owner == sender else person(authority.certified_who(sender, operation.who), str(sender))
         instant.touched.add(arc)
         instant.ended.append(event(arc, by))
         self.waiting.setdefault(arc, []).append(ticket)
@@ -390,7 +390,7 @@ class Operations:
             raise Refused("bad_request", f"{asked.id} is already a request; ask how it stands")
         request = self._admission.admit(asked, sender, self)
         if asked.check:
-            self._door.check(now, asked.needs, waits=asked.wait_for_device)
+            self._device_check.check(now, asked.needs, waits=asked.wait_for_device)
         expected = forecast(self.core, now, request, self._runtimes)
         start = expected.starts.get(arc)
         victims = [known.request for known in map(self.core.arc, expected.preempts) if known is not None]

@@ -1,4 +1,4 @@
-"""What a leader sees of other hosts: how many tokens, and whether it was away itself when they went (rule 9). Pure."""
+"""Counts the tokens of other hosts, and judges if this leader itself was away when they disappeared (rule 9). Pure."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from typing import Final
 from zscout.types import HostName, Ns
 
 AWAY_PART: Final = 0.25
-"""A leader that stalled for this part of the mesh lease, or lost several hosts within it, was away itself."""
+"""A leader that stalled for more than this part of the mesh lease, or lost several hosts within it, was away itself."""
 MAX_TOKENS: Final = 2_000
-"""Tokens of one host that count: later ones are ignored."""
+"""Tokens of one host that count: further tokens are ignored."""
 
 
 class Sight:
@@ -18,7 +18,7 @@ class Sight:
         self.me, self.lease, self._span = me, lease, round(AWAY_PART * lease)
         self._tokens: Counter[HostName] = Counter()
         self._stall: tuple[Ns, Ns, bool] = (0, 0, False)
-        """The last stall of this process: its length, its end, and whether it ended just now."""
+        """The last stall of this process: its length, its end, and True if it ended just now."""
         self._gone: deque[tuple[Ns, HostName]] = deque()
         """Hosts whose last tokens disappeared recently, and when."""
         self._away_until: Ns = 0
@@ -28,7 +28,7 @@ class Sight:
         self._stall = length, ended, fresh
 
     def count(self, host: HostName, *, alive: bool) -> bool:
-        """Count a token that came or went. Return False if it is one too many."""
+        """Count a token that appeared or disappeared. Return False if its host has MAX_TOKENS already."""
         if alive and self._tokens[host] >= MAX_TOKENS:
             return False
         self._tokens[host] += 1 if alive else -1
@@ -40,7 +40,7 @@ class Sight:
         return length > self._span and now - ended < self.lease
 
     def is_away(self, now: Ns) -> bool:
-        """Return True while what disappears may be there."""
+        """Return True while this leader may be away, so that tokens that disappear may still exist."""
         return now < self._away_until
 
     def lost(self, now: Ns, host: HostName) -> bool:

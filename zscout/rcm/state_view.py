@@ -24,19 +24,19 @@ MAX_REASON: Final = 500
 
 
 STATE_AGE: Final[Ns] = SECOND // 20
-"""An answer may be this old (rule 20): building it costs as much as many grants."""
+"""The age at most of a cached answer (rule 20): building an answer costs as much as many grants."""
 MAX_BUILT: Final = 4
-"""Answers of one kind that are built within STATE_AGE, where the state changes."""
+"""Answers of one kind that are built within STATE_AGE while the state changes."""
 
 
 class _Built(NamedTuple):
-    """An answer, and after which batch of events it was built."""
+    """A cached answer. `batches`: the core's batches of events when it was built."""
 
     state: messages.RcmState
     encoded: bytes
     batches: int
     built: int
-    """How many were built within STATE_AGE."""
+    """Answers of this kind built within STATE_AGE."""
 
 
 class StateView:
@@ -57,9 +57,9 @@ class StateView:
         self._since: Ns = 0
 
     def answer(self, asked: messages.StateAsk, seq: int, now: Ns) -> tuple[messages.RcmState, bytes | None]:
-        """The answer, and the same encoded where it is known."""
+        """The answer, and its encoded form if that is cached."""
         if asked.holds_only:
-            return self.state(asked, seq, now), None  # RCs reckon ends by it: never of an earlier instant
+            return self.state(asked, seq, now), None  # RCs compute ends of holds from this answer: never a cached one
         alike, batches = replace(asked, arc=None), self._core.batches
         if now - self._since > STATE_AGE:
             self._since = now
@@ -95,7 +95,7 @@ class StateView:
         return state
 
     def _devices(self, status: Status, now: Ns) -> list[messages.RcView]:
-        """All RCs that are there or expected. What somebody asks for and nobody ever offered is not among them."""
+        """All RCs that are present or expected; not RCs that were requested and never offered."""
         known = {rc.name: rc for rc in status.rcs}
         devices = self._devices_known
         devices.forget_old(now)
@@ -118,7 +118,7 @@ class StateView:
 
 
 def _of(arc: ArcStatus) -> dict[str, Any]:
-    """What all messages have of an ARC."""
+    """The fields of an ARC that all messages have."""
     return {
         "id": request_id(arc.id),
         "arc": arc.name,
@@ -132,7 +132,7 @@ def _of(arc: ArcStatus) -> dict[str, Any]:
 
 
 def _held(arc: ArcStatus, hold: Hold, now: Ns) -> dict[str, Any]:
-    """What all messages have of a hold."""
+    """The fields of a hold that all messages have."""
     return {
         **_of(arc),
         "grant": hold.grant,
@@ -155,12 +155,12 @@ def holders_of(arcs: Iterable[ArcStatus], rc: str, now: Ns) -> list[messages.Hol
 
 
 def waits_in(hold: Hold, now: Ns) -> float | None:
-    """Seconds until the devices of a hold have begun, at most; None: they have."""
+    """Seconds at most until all devices of a hold have begun; None: they have."""
     return None if (left := hold.starting(now)) is None else left / SECOND
 
 
 def _protected_from(hold: Hold, now: Ns) -> float | None:
-    # Its devices may begin at once: its minimum runtime would be over then.
+    # The hold's devices may begin at once, and then its minimum runtime ends first.
     end = now + hold.remaining(now)
     is_protected = hold.protected_below is not None and hold.protected_from < end
     return (end - hold.protected_from) / SECOND if is_protected else None

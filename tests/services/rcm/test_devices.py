@@ -22,8 +22,8 @@ def shown(devices: ExpectedDevices, now: Ns, *, named: str | None = None, presen
 
 def test_one_that_went_is_expected_for_a_day_with_where_it_was() -> None:
     devices = ExpectedDevices({})
-    devices.came(token("ws1"))
-    devices.went(token("ws1"), 100 * SECOND)
+    devices.token_came(token("ws1"))
+    devices.token_went(token("ws1"), 100 * SECOND)
     view = shown(devices, 160 * SECOND)
     assert (view.host, view.reason, view.gone) == ("ws1", "the node of ws1 is gone", 60.0)
     devices.forget_old(100 * SECOND + REMEMBERED)
@@ -34,15 +34,15 @@ def test_one_that_went_is_expected_for_a_day_with_where_it_was() -> None:
 
 def test_the_reason_tells_a_host_that_is_gone_from_one_that_has_it_no_more() -> None:
     devices = ExpectedDevices({})
-    devices.came(token("ws1"))
-    devices.came(token("ws1", "other", "robot/b"))
-    devices.went(token("ws1"), 0)
+    devices.token_came(token("ws1"))
+    devices.token_came(token("ws1", "other", "robot/b"))
+    devices.token_went(token("ws1"), 0)
     assert shown(devices, 0).reason == "it is gone from ws1"
-    devices.went(token("ws1", "other", "robot/b"), SECOND)
+    devices.token_went(token("ws1", "other", "robot/b"), SECOND)
     assert shown(devices, SECOND).reason == "the node of ws1 is gone"
     devices.stopped(ARM, "ws1")
     assert shown(devices, SECOND).reason == "it is stopped at ws1"
-    devices.came(token("ws1", "new"))
+    devices.token_came(token("ws1", "new"))
     view = shown(devices, SECOND, named="ws1", present=True)
     assert (view.host, view.reason, view.gone) == ("ws1", "", None)
 
@@ -59,8 +59,8 @@ def test_one_that_the_fleet_file_names_is_expected_though_it_was_never_there() -
 def test_of_several_homes_the_others_are_told_those_that_live_and_those_that_are_not_seen() -> None:
     devices = ExpectedDevices({})
     for host in ("ws1", "ws2", "ws3"):
-        devices.came(token(host, host))
-    devices.went(token("ws3", "ws3"), 5 * SECOND)
+        devices.token_came(token(host, host))
+    devices.token_went(token("ws3", "ws3"), 5 * SECOND)
     view = shown(devices, 7 * SECOND, named="ws2", present=True)
     assert (view.host, view.duplicates, view.unseen) == ("ws2", ["ws1"], {"ws3": 2.0})
     # One that was stopped on purpose is no other owner.
@@ -72,20 +72,20 @@ def test_of_several_homes_the_others_are_told_those_that_live_and_those_that_are
 
 def test_two_instances_of_one_host_hide_no_death() -> None:
     devices = ExpectedDevices({})
-    devices.came(token("ws1", "old"))
-    devices.came(token("ws1", "new"))
-    devices.went(token("ws1", "old"), SECOND)
+    devices.token_came(token("ws1", "old"))
+    devices.token_came(token("ws1", "new"))
+    devices.token_went(token("ws1", "old"), SECOND)
     assert shown(devices, SECOND).gone is None
-    devices.went(token("ws1", "new"), 2 * SECOND)
+    devices.token_went(token("ws1", "new"), 2 * SECOND)
     assert shown(devices, 3 * SECOND).gone == 1.0
 
 
 def test_what_another_knows_is_taken_where_nothing_better_is_known() -> None:
     now = 5_000 * SECOND
     leader, late = ExpectedDevices({}), ExpectedDevices({})
-    leader.came(token("ws1"))
-    leader.said(RcState(ARM, "ws1", "i", sharable=True, parameters=BOUND))
-    leader.went(token("ws1"), now - 60 * SECOND)
+    leader.token_came(token("ws1"))
+    leader.report(RcState(ARM, "ws1", "i", sharable=True, parameters=BOUND))
+    leader.token_went(token("ws1"), now - 60 * SECOND)
     leader.stopped(ARM, "ws1")
     views = [shown(leader, now)]
     late.remember(homes_in(views), now + 10 * SECOND)
@@ -93,11 +93,11 @@ def test_what_another_knows_is_taken_where_nothing_better_is_known() -> None:
     assert (view.host, view.gone, view.reason) == ("ws1", 60.0, "it is stopped at ws1")
     assert (view.sharable, view.parameters) == (True, BOUND)
     # It sees the token: that is better than anybody's word.
-    late.came(token("ws1", "back"))
+    late.token_came(token("ws1", "back"))
     late.remember(homes_in(views), now + 20 * SECOND)
     assert shown(late, now + 20 * SECOND, named="ws1", present=True).gone is None
     # Older news than its own.
-    late.went(token("ws1", "back"), now + 30 * SECOND)
+    late.token_went(token("ws1", "back"), now + 30 * SECOND)
     late.remember([SeenHome(ARM, "ws1", 100.0, "long ago")], now + 31 * SECOND)
     assert (shown(late, now + 31 * SECOND).gone, shown(late, now).reason) == (1.0, "the node of ws1 is gone")
 
@@ -105,8 +105,8 @@ def test_what_another_knows_is_taken_where_nothing_better_is_known() -> None:
 def test_a_list_of_devices_has_all_homes_of_each() -> None:
     devices, other = ExpectedDevices({}), ExpectedDevices({})
     for host in ("ws1", "ws2", "ws3"):
-        devices.came(token(host, host))
-    devices.went(token("ws3", "ws3"), 0)
+        devices.token_came(token(host, host))
+    devices.token_went(token("ws3", "ws3"), 0)
     other.remember(homes_in([shown(devices, 4 * SECOND, named="ws1", present=True)]), 4 * SECOND)
     assert {home.host: home.ago for home in other.homes(4 * SECOND)} == {"ws1": 0.0, "ws2": 0.0, "ws3": 4.0}
 

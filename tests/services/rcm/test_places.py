@@ -77,7 +77,7 @@ def test_places_that_are_kept_have_a_limit() -> None:
     for arrival in range(MAX_KEPT + 10):
         of.bind(Place(NEW, arrival), f"desk/one/q{arrival}", 0)
         of.end(f"desk/one/q{arrival}", 0, MINUTE + arrival)
-    assert len(of._owners) == len(of._over) == MAX_KEPT
+    assert len(of._owners) == len(of._expiries) == MAX_KEPT
 
 
 def test_an_unknown_place_of_an_earlier_term_is_taken_once_by_who_is_seen() -> None:
@@ -85,10 +85,10 @@ def test_an_unknown_place_of_an_earlier_term_is_taken_once_by_who_is_seen() -> N
     place = Place(OLD, 7)
     assert not of.may_claim(place, "desk/one", "q1", None, seen=False)
     assert of.may_claim(place, "desk/one", "q1", None, seen=True)
-    assert of.takes_the_word_for(place)
-    assert not places(KEY).takes_the_word_for(place)
+    assert of.is_unproven(place)
+    assert not places(KEY).is_unproven(place)
     of.bind(place, "desk/one/q1", 0)
-    assert not of.takes_the_word_for(place)
+    assert not of.is_unproven(place)
     assert not of.may_claim(place, "desk/two", "q2", None, seen=True)
 
 
@@ -96,7 +96,7 @@ def test_who_expects_an_arc_may_claim_its_place_where_there_is_no_key() -> None:
     for key in (None, KEY):
         of = places(key)
         of.bind(Place(OLD, 7), "desk/one/q1", 0)
-        of.admit("desk/one/q1", {"cart/two"})
+        of.allow_claims("desk/one/q1", {"cart/two"})
         assert of.may_claim(Place(OLD, 7), "cart/two", "q1", None, seen=True) == (key is None)
 
 

@@ -31,7 +31,7 @@ from zscout.messages import (
     exact_amounts,
 )
 from zscout.rcm.admission import Admission
-from zscout.rcm.door import Door
+from zscout.rcm.device_check import DeviceCheck
 from zscout.rcm.places import request_id
 from zscout.rcm.steps import Keep, Proposed, Ticket
 from zscout.scheduling.booking import Booking
@@ -71,11 +71,11 @@ class BookingHandler:
         records: Records,
         dates_: BookedDates,
         admission: Admission,
-        door: Door,
+        device_check: DeviceCheck,
         runtimes: RuntimeEstimator | None,
     ) -> None:
         self._fleet, self._core, self._records, self._dates = fleet, core, records, dates_
-        self._admission, self._door = admission, door
+        self._admission, self._device_check = admission, device_check
         self._runtimes = runtimes
         """What is known of how long holds last, for hints."""
         self.undecided: list[_Undecided] = []
@@ -100,7 +100,7 @@ class BookingHandler:
         self._admission.check_booking(wanted, sender, held=wanted.broken and self._is_held(wanted.needs, sender))
         record = self._record(wanted, sender)
         named = {need: amounts for need, amounts in wanted.needs.items() if host_in(need) is None}
-        self._door.check(self._now, named, may_wait=False)
+        self._device_check.check(self._now, named, may_wait=False)
         self._try(_Undecided(ticket, lambda: self._is_made(ticket, record.id, sender) or self._decide(ticket, record)))
 
     def _is_held(self, needs: Collection[Need], sender: Sender) -> bool:
@@ -148,7 +148,7 @@ class BookingHandler:
             raise Refused("bad_date", "each date would overlap the next; make it shorter, or less often")
         made = self._dates.number()
         fields = {name: getattr(wanted, name) for name in Book.__struct_fields__}
-        fields["who"] = self._admission.authority.known_as(sender, wanted.who)
+        fields["who"] = self._admission.authority.certified_who(sender, wanted.who)
         if wanted.maintenance:
             fields["priority"] = max(wanted.priority, self._fleet.operator_priority)
         return BookingRecord(**fields, owner=sender.host, since=int(time), made=made, changed=made)
@@ -273,7 +273,7 @@ class BookingHandler:
         runtime = duration(asked.runtime, "runtime")
         self._check_length(asked.runtime)
         now = self._now
-        self._door.check(now, asked.needs, may_wait=False)
+        self._device_check.check(now, asked.needs, may_wait=False)
         start = self._dates.local(max(asked.start or 0, -(-self._dates.to_fleet(now) // SECOND)))
         within = min(asked.within, MAX_AHEAD - (start - now) / SECOND)
         if within < 0:

@@ -13,7 +13,7 @@ from zscout.keyexpr import BadName, Sender
 from zscout.messages import Ask, BookingRecord, BookingsKept, Operation, Problem, Refused
 from zscout.rcm.admission import Admission
 from zscout.rcm.deadlines import Deadlines
-from zscout.rcm.door import Door
+from zscout.rcm.device_check import DeviceCheck
 from zscout.rcm.steps import Again, BookedDanger, ClocksRead, Keep, Outbox, Proposed, Ticket
 from zscout.scheduling.booking import BookingConflict, BookingThreatened, Dates
 from zscout.scheduling.core import Core
@@ -57,7 +57,7 @@ class Bookings:
         fleet: Fleet,
         core: Core,
         admission: Admission,
-        door: Door,
+        device_check: DeviceCheck,
         records: Records,
         clock: FleetClock,
         runtimes: RuntimeEstimator | None,
@@ -67,7 +67,7 @@ class Bookings:
         self._adaptive = fleet.strategy == "adaptive"
         self._strategy, self._records, self.clock, self.settles_at = fleet.strategy, records, clock, settles_at
         self.dates = BookedDates(core, records, clock)
-        self.handler = BookingHandler(fleet, core, records, self.dates, admission, door, runtimes)
+        self.handler = BookingHandler(fleet, core, records, self.dates, admission, device_check, runtimes)
         self._deadlines: Deadlines[tuple[_Due, Any]] = Deadlines()
         self._set: set[_Due] = set()
         """Those of which there is one at a time."""
@@ -259,7 +259,7 @@ def bookings_of(
     fleet: Fleet,
     core: Core,
     admission: Admission,
-    door: Door,
+    device_check: DeviceCheck,
     keeper: BookingKeeper,
     kept: Sequence[BookingsKept],
     runtimes: RuntimeEstimator | None,
@@ -269,7 +269,7 @@ def bookings_of(
     time, age = _time(keeper, kept)
     keeper.records.take(record for told in kept for record in told.records)
     clock, settles_at = FleetClock(time, now, now - round(age * SECOND)), now + round(fleet.mesh.lease * SECOND)
-    return Bookings(fleet, core, admission, door, keeper.records, clock, runtimes, 0 if known else settles_at)
+    return Bookings(fleet, core, admission, device_check, keeper.records, clock, runtimes, 0 if known else settles_at)
 
 
 def oldest(answers: Iterable[BookingsKept]) -> tuple[float, Ns] | None:

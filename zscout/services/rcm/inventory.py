@@ -58,7 +58,7 @@ class Inventory:
         keys, mesh = self.mesh.keys, self.mesh
         self._supervisor = supervisor
         # Tokens that live are told of anew.
-        self.devices.lost_sight(mesh.now())
+        self.devices.forget_tokens(mesh.now())
         for declared in (
             mesh.subscribe(keys.rc_state_any, RcState, supervisor.guard(self._on_state)),
             mesh.watch(keys.alive_any(Role.RC), supervisor.guard(self._on_token)),
@@ -73,9 +73,9 @@ class Inventory:
 
     def _on_token(self, token: Token, alive: bool) -> None:
         if alive:
-            self.devices.came(token)
+            self.devices.token_came(token)
         else:
-            self.devices.went(token, self.mesh.now())
+            self.devices.token_went(token, self.mesh.now())
 
     def _on_state(self, key: str, state: RcState) -> None:
         if self.mesh.keys.rc_of(key) != state.rc:
@@ -83,7 +83,7 @@ class Inventory:
         if state.leaving:
             self.devices.stopped(state.rc, state.host)
         elif not state.duplicate_of:
-            self.devices.said(state)
+            self.devices.report(state)
 
     def _on_leader(self, token: Token, alive: bool) -> None:
         """Who comes late asks for what went before."""

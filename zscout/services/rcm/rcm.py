@@ -23,7 +23,7 @@ from zscout.mesh.supervision import Alarm, StallWatch, Supervisor
 from zscout.rcm import steps
 from zscout.rcm.admission import Admission
 from zscout.rcm.authority import Authority
-from zscout.rcm.door import Door
+from zscout.rcm.device_check import DeviceCheck
 from zscout.rcm.leader import Leader
 from zscout.rcm.places import Places
 from zscout.rcm.recovery import RecoveredState
@@ -93,11 +93,11 @@ class Rcm:
         self.inventory = parts.inventory or Inventory(mesh, fleet)
         devices, me, now = self.inventory.devices, mesh.me.host, mesh.now()
         roster = Roster(mesh.keys, me, fleet, term, devices, admission, core.arc, now)
-        door = Door(devices, roster, now + fleet.timing.hold_lease)
+        device_check = DeviceCheck(devices, roster, now + fleet.timing.hold_lease)
         keeper = parts.keeper or BookingKeeper(mesh)
-        bookings = bookings_of(fleet, core, admission, door, keeper, parts.kept, parts.runtimes)
+        bookings = bookings_of(fleet, core, admission, device_check, keeper, parts.kept, parts.runtimes)
         self.sharing = BookingSharing(mesh, term, keeper, bookings, authority, self.supervisor, self._take)
-        self.leader = Leader(fleet, core, admission, roster, door, bookings, parts.runtimes)
+        self.leader = Leader(fleet, core, admission, roster, device_check, bookings, parts.runtimes)
         self._view = StateView(me, core, roster, self.leader.registry, devices, parts.runtimes)
         self._digest = HoldDigest(core, parts.listeners) if parts.listeners else None
         self._grants = mesh.publisher(mesh.keys.grants, messages.Grants)

@@ -1,6 +1,6 @@
-"""What is refused at once because it can never start, by what the leader knows. Pure.
+"""Refuses requests whose devices are unknown, or can never do what is asked of them. Pure.
 
-Only who asks for it is refused so (`Ask.check`): others are queued, whatever they need."""
+Only requests with `Ask.check` are checked: others are queued whatever they need."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from zscout.rcm.roster import Roster
 from zscout.types import Need, Ns, RcName
 
 MAX_NAMED = 8
-"""Parameters that a refusal lists."""
+"""Parameters, or devices, in one refusal."""
 
 
-class Door:
-    """The check by what one leader knows. Until `settles` an RC that was not seen may still be one of the fleet."""
+class DeviceCheck:
+    """Checks needs against the devices that a leader knows. Before `settles` an unseen RC may still show up."""
 
     def __init__(self, devices: ExpectedDevices, roster: Roster, settles: Ns) -> None:
         self._devices, self._roster, self._settles = devices, roster, settles
 
     def check(self, now: Ns, needs: Mapping[Need, Amounts], *, waits: bool = False, may_wait: bool = True) -> None:
-        """Raises Refused for what is neither expected nor there, and for more RCs of a pattern than match it; with
-        `waits`, they are waited for. `may_wait`: whether the requester may choose that."""
+        """Raises Refused for unknown devices and for more RCs of a pattern than match it, unless the request `waits`
+        for them; and for parameters that no matching RC accepts. `may_wait`: the remedy mentions that option."""
         waits, expected, is_there = waits or now < self._settles, self._devices.names, self._roster.is_known
         wanted = Counter(need.partition("#")[0] for need in needs if is_pattern(need))
         for need, params in needs.items():
@@ -43,7 +43,7 @@ class Door:
             if is_pattern(need) and not waits and len(left) < wanted[need.partition("#")[0]]:
                 raise _too_few(need.partition("#")[0], left, wanted, may_wait=may_wait)
             refusals = [_objection(rc, params, self._parameters(rc)) for rc in matching]
-            # One that takes it is enough.
+            # One RC that accepts the parameters is enough.
             if refusals and all(refusals):
                 raise next(filter(None, refusals))
 
@@ -72,10 +72,10 @@ def _unknown(need: Need, known: Collection[RcName], *, may_wait: bool) -> Refuse
 
 
 def _objection(rc: RcName, params: Amounts, parameters: Parameters | None) -> Refused | None:
-    """Why this RC can never carry that."""
+    """The refusal for parameters that this RC can never accept."""
     if parameters is None:
         return None
-    bounds = {one.name: one for one in parameters}
+    bounds = {parameter.name: parameter for parameter in parameters}
     for name, value in params.items():
         if name not in bounds:
             names = sorted(bounds)
@@ -84,10 +84,10 @@ def _objection(rc: RcName, params: Amounts, parameters: Parameters | None) -> Re
             takes = f"it has {', '.join(names[:MAX_NAMED])}{more}" if names else "it has none"
             hint = f"did you mean {near[0]}?" if near else takes
             return Refused("unknown_parameter", f"{rc} has no parameter {name}; {hint}")
-        one = bounds[name]
-        if one.bound is not None and value > one.bound and not any(other in params for other in one.unless):
-            unit = f" {one.unit}" if one.unit else ""
-            asked = f"{name} {_text(value)} of {_text(one.bound)}{unit} at {rc}"
+        limit = bounds[name]
+        if limit.bound is not None and value > limit.bound and not any(other in params for other in limit.unless):
+            unit = f" {limit.unit}" if limit.unit else ""
+            asked = f"{name} {_text(value)} of {_text(limit.bound)}{unit} at {rc}"
             return Refused("too_much", f"can never start: {asked}; request less")
     return None
 

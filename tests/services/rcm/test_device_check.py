@@ -14,8 +14,8 @@ from tests.services.rcm.booked_fleet import do
 from tests.services.rcm.kit import FakeFleet, Refusal, fleet_of, grant_of, request
 from zscout.mesh import Refused
 from zscout.messages import Amounts, Foresee, Foresight, Parameter, Parameters, RcState
+from zscout.rcm.device_check import DeviceCheck
 from zscout.rcm.devices import ExpectedDevices
-from zscout.rcm.door import Door
 from zscout.types import SECOND
 
 RADIO = [
@@ -35,10 +35,10 @@ def refusal(*needs: str, waits: bool = False, may_wait: bool = True, params: Map
     amounts: Amounts = {name: Decimal(str(value)) for name, value in (params or {}).items()}
     wanted, devices = dict.fromkeys(needs, amounts), ExpectedDevices({"anvil": KNOWN})
     for rc, parameters in KNOWN.items():
-        devices.said(RcState(rc, "anvil", "1", sharable=False, parameters=parameters))
+        devices.report(RcState(rc, "anvil", "1", sharable=False, parameters=parameters))
     nobody: Any = SimpleNamespace(is_known=lambda _: False, reported=lambda _: None)
     try:
-        Door(devices, nobody, 0).check(0, wanted, waits=waits, may_wait=may_wait)
+        DeviceCheck(devices, nobody, 0).check(0, wanted, waits=waits, may_wait=may_wait)
     except Refused as refused:
         return f"{refused.problem.code}: {refused.problem.message}"
     return ""
@@ -92,13 +92,13 @@ def test_what_can_never_start_is_refused_with_what_to_mend(need: str, params: di
     ],
 )
 def test_more_of_a_pattern_than_the_fleet_knows_of_is_refused(needs: list[str], words: str) -> None:
-    said = refusal(*needs, may_wait=False)
-    assert said.startswith(words)
-    assert bool(said) is bool(words)
+    refused = refusal(*needs, may_wait=False)
+    assert refused.startswith(words)
+    assert bool(refused) is bool(words)
     may_wait = refusal(*needs)
     assert may_wait.startswith(words)
     assert ("add --wait-for-device" in may_wait) is bool(words)
-    assert "--wait-for-device" not in said
+    assert "--wait-for-device" not in refused
     assert refusal(*needs, waits=True) == ""
 
 
