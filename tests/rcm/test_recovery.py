@@ -240,7 +240,7 @@ def test_a_hold_with_a_wrong_binding_is_left_out(bound: dict[str, str], missing:
     other = rc("robot/x", hold(("robot/x",), name="good"))
     found = recover_plain([*wrong, other], [], NOW)
     assert summary(found) == (["good"], [])
-    assert found.remarks[0].startswith("the hold of h/one/gang-id is not carried on: ")
+    assert found.remarks[0].startswith("the hold of h/one/gang-id is not recovered: ")
 
 
 def test_what_waits_keeps_place_and_parameters() -> None:

@@ -15,7 +15,7 @@ from zscout.rcm.devices import ExpectedDevices
 from zscout.rcm.places import Places
 from zscout.rcm.roster import Roster
 from zscout.rcm.sight import MAX_TOKENS
-from zscout.rcm.steps import Outbox, Why
+from zscout.rcm.steps import Outbox, Purpose
 from zscout.scheduling.model import ClientLost
 from zscout.types import SECOND, Term
 
@@ -56,7 +56,7 @@ def test_a_host_s_tokens_disappear_in_one_go() -> None:
         assert not members.client_token(SECOND, token(number), alive=False).events
     judged = members.tick(SECOND + roster.TOKEN_SPREAD)
     # A leader that is not away is answered by another host: then all are lost, in one instant.
-    assert [question.why for question in judged.questions] == [Why.WITNESS]
+    assert [question.purpose for question in judged.questions] == [Purpose.WITNESS]
     assert not judged.events
     lost = members.answered(2 * SECOND, judged.questions[0], object(), None)
     assert len(lost.events) == MAX_TOKENS
@@ -80,7 +80,7 @@ def test_an_rc_speaks_for_itself_alone() -> None:
     [question] = members.rc_token(0, shown, alive=True).questions
     state = RcState("robot/a", "desk", "desk-1", sharable=False, term=Term(1, "rcm"))
     members.answered(0, question, state, None)
-    back = question._replace(why=Why.RETURN)
+    back = question._replace(purpose=Purpose.RETURN)
     for other in (structs.replace(state, rc="no name"), structs.replace(state, instance="desk-2")):
         assert members.answered(1, back, structs.replace(other, health="broken"), None) == Outbox()
         assert not members.is_known("no name")

@@ -20,7 +20,7 @@ def rc(counter: int, host: str = "cart") -> Word:
 
 
 def hear(terms: Terms, word: Word, now: int = NOW) -> Verdict:
-    return terms.hear(word, now, heard=True)
+    return terms.weigh(word, now, heard=True)
 
 
 @pytest.mark.parametrize(

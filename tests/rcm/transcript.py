@@ -59,7 +59,7 @@ from zscout.rcm.leader import Leader
 from zscout.rcm.places import Places
 from zscout.rcm.recovery import take_over
 from zscout.rcm.roster import Roster
-from zscout.rcm.steps import Why
+from zscout.rcm.steps import Purpose
 from zscout.scheduling.booking import Booking, Dates
 from zscout.scheduling.core import Core
 from zscout.scheduling.model import Effect, HoldEnded, Propose, Vote
@@ -117,7 +117,7 @@ class LeaderPlayer:
     now: Ns = 0
     states: list[RcState] = field(default_factory=list)
     lists: list[ClientRequests] = field(default_factory=list)
-    open: dict[tuple[Why, str], Any] = field(default_factory=dict)
+    open: dict[tuple[Purpose, str], Any] = field(default_factory=dict)
     tickets: list[str] = field(default_factory=list)
 
     def __post_init__(self) -> None:
@@ -170,9 +170,9 @@ class LeaderPlayer:
                 return [steps.TokenSeen(self._token(*what), name == "come")]
             case "promise":
                 state = structs.replace(self._state(*what), term=OWN)
-                return [steps.QuestionAnswered(self.open.pop((Why.PROMISE, what[0])), state)]
+                return [steps.QuestionAnswered(self.open.pop((Purpose.PROMISE, what[0])), state)]
             case "requests":
-                return [steps.QuestionAnswered(self.open.pop((Why.REQUESTS, what[0])), self._requests(*what))]
+                return [steps.QuestionAnswered(self.open.pop((Purpose.REQUESTS, what[0])), self._requests(*what))]
             case "state":
                 state = structs.replace(self._state(*what), term=OWN, seq=self.leader.seq)
                 return [steps.Reported(state)]
@@ -183,9 +183,9 @@ class LeaderPlayer:
             case "handover":
                 return [self._asked(what[0], HandOver(what[1], what[2]))]
             case "vote":
-                return [steps.Happened([Vote(int(what[0]), what[1] == "yes")])]
+                return [steps.CoreEvents([Vote(int(what[0]), what[1] == "yes")])]
             case "dates":
-                return [steps.Happened([Dates(tuple(map(self._date, what)))])]
+                return [steps.CoreEvents([Dates(tuple(map(self._date, what)))])]
             case "reload":
                 self.authority.reload(structs.replace(self.fleet, access=_access(what)))
                 return [steps.Reloaded()]
@@ -270,8 +270,8 @@ class LeaderPlayer:
             yield f"propose {proposed.proposal.proposal} to {proposed.rc}"
         for question in out.questions:
             subject = question.token.name if question.token is not None else question.client
-            self.open[question.why, subject] = question
-            yield f"question {subject or question.key}: {question.why.value}"
+            self.open[question.purpose, subject] = question
+            yield f"question {subject or question.key}: {question.purpose.value}"
         yield from (f"date    {_effect(effect)}" for effect in out.effects if "Booking" in type(effect).__name__)
         yield from (f"strange {text}" for _, text in out.strange)
         for text in out.log:

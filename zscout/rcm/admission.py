@@ -54,7 +54,7 @@ class Holding(Present, Protocol):
 
 
 @dataclass(slots=True)
-class LetIn:
+class Admitted:
     """The requests admitted so far in one instant, before the core has them."""
 
     waiting_now: int = 0
@@ -252,15 +252,19 @@ class Admission:
 
 
 def binding(
-    needs: Mapping[Need, Params], held: Collection[RcName], told: Mapping[Need, RcName]
+    needs: Mapping[Need, Params], held: Collection[RcName], reported: Mapping[Need, RcName]
 ) -> dict[Need, RcName] | None:
-    """The RC for each pattern, if `held` are exactly what meets `needs`: as `told` if that is valid; else None."""
+    """The RC for each pattern if `held` meet `needs` exactly, else None: as `reported` if that is valid."""
     patterns = [need for need in needs if is_pattern(need)]
     left = {*held} - needs.keys()
     if len(needs) != len({*held}) or len(left) != len(patterns):
         return None
-    if told.keys() == {*patterns} and {*told.values()} == left and all(matcher(need)(rc) for need, rc in told.items()):
-        return dict(told)
+    if (
+        reported.keys() == {*patterns}
+        and {*reported.values()} == left
+        and all(matcher(need)(rc) for need, rc in reported.items())
+    ):
+        return dict(reported)
     found: dict[RcName, Need] = {}
     for need in patterns:
         if not _meets(need, left, found, set()):
@@ -269,7 +273,7 @@ def binding(
 
 
 def _meets(need: Need, left: Collection[RcName], found: dict[RcName, Need], tried: set[RcName]) -> bool:
-    """Find an RC for a pattern; other patterns may get another one for that."""
+    """Find an RC for a pattern, and move other patterns to other RCs if necessary."""
     for rc in sorted(left):
         if rc not in tried and matcher(need)(rc):
             tried.add(rc)

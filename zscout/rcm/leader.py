@@ -1,8 +1,8 @@
 """The leading RCM as one pure step: stimuli in, an Outbox out. No clock, task, logger or mesh.
 
 A step is one instant of the core: operations that arrive together, or one other stimulus. Its Outbox comes in parts:
-grants are answered and published before the rest is computed. What follows in another instant is put before the
-stimuli that wait, and the last part says that there is more."""
+grants are answered and published before the rest is computed. Stimuli that a step creates are queued before all others;
+the last part has `more` set while stimuli are left."""
 
 from __future__ import annotations
 
@@ -32,31 +32,32 @@ from zscout.scheduling.core import Core
 from zscout.scheduling.runtimes import RuntimeEstimator
 from zscout.types import SECOND, ArcId, ClientId, Ns, RcName
 
-CHARGED_EVERY: Final[Ns] = 10 * SECOND
-"""From one publication of what groups had to the next: what is lost with a leader."""
-KEPT: Final[Mapping[model.Outcome, Ns]] = MappingProxyType(
+USAGE_PERIOD: Final[Ns] = 10 * SECOND
+"""Between publications of usage per group and of patience: a leader that dies loses at most this much usage."""
+PLACE_KEPT: Final[Mapping[model.Outcome, Ns]] = MappingProxyType(
     {model.Outcome.RELEASED: 0, model.Outcome.CANCELLED: 0, model.Outcome.CLIENT_LOST: 86_400 * SECOND}
 )
-"""For how long a client may ask again for the place of what ended so; else it is for as long as that is known."""
-CONTINUED: Final = frozenset({model.LeadTaken, model.Adopted, model.Vouched, model.HandedOver})
-"""Events by which holds that stand go on: the RCs hear of that before anybody else."""
+"""The time for which a client may claim the place of an ARC that ended with this outcome; with others, REMEMBERED."""
+CONTINUING: Final = frozenset({model.LeadTaken, model.Adopted, model.Vouched, model.HandedOver})
+"""Events by which existing holds continue: they are published to the RCs before any client is notified."""
 
 
-BOOKINGS: Final = (messages.Book, messages.Unbook, messages.FindSlots)
+BOOKING_OPERATIONS: Final = (messages.Book, messages.Unbook, messages.FindSlots)
 
 
 class _Instant(NamedTuple):
-    """A decided instant: what its answers, publication and follow-up are made of."""
+    """A decided instant, from which its publication and follow-up are made."""
 
     events: Sequence[model.Event]
     effects: Sequence[model.Effect]
-    named: Collection[RcName] | None
+    extra_rcs: Collection[RcName] | None
+    """RCs to publish even if they did not change; None: publish only changes."""
     notified: Collection[ArcId]
-    """ARCs whose clients know of their grants."""
+    """ARCs whose grants were answered or notified already."""
 
 
 class Leader:
-    """One term. `bookings`: those of the fleet."""
+    """The leader of one term."""
 
     def __init__(
         self,
@@ -73,22 +74,22 @@ class Leader:
         self.registry = RequestLog(core, roster, admission.places, runtimes)
         self.operations = Operations(fleet, core, self.registry, roster, admission, device_check, bookings, runtimes)
         self._parts = roster, self.registry, self.operations, bookings
-        """All that has deadlines."""
+        """All parts with deadlines."""
         self.seq = 0
-        """The last number that was published."""
+        """The number of the last publication."""
         self.published: Ns = 0
-        """When that was."""
-        self._charged: Ns = 0
-        """When what groups had was published last."""
-        self._named: dict[RcName, int] = {}
-        """The number of the last publication that named an RC."""
+        """The time of the last publication or heartbeat."""
+        self._usage_published: Ns = 0
+        """The time of the last publication of usage per group."""
+        self._last_seqs: dict[RcName, int] = {}
+        """By RC: the number of the last publication with its holders."""
         self._recovered: dict[ClientId, set[ArcId]] = {}
         """By client: the ARCs that only RCs have reported."""
         self._queue: deque[steps.Stimulus] = deque()
         self._wake: Ns | None = None
-        """When deadlines are over."""
-        self._waking = False
-        """What is due waits among the stimuli."""
+        """The earliest deadline of all parts."""
+        self._due_queued = False
+        """True while a `Due` is among the stimuli."""
         self._core_wake: Ns | None = None
         self._now: Ns = 0
         self._out = steps.Outbox()
@@ -100,8 +101,8 @@ class Leader:
         self._out = out
         self._bookings.at(now)
         self._queue.extend(stimuli)
-        if self._wake is not None and self._wake <= now and not self._waking:
-            self._waking = True
+        if self._wake is not None and self._wake <= now and not self._due_queued:
+            self._due_queued = True
             self._queue.append(steps.Due.DEADLINES)
         if (events := self._next()) and (instant := self._grant(events)) is not None:
             if out.granted or out.grant_notices:
@@ -117,15 +118,15 @@ class Leader:
         out.more = bool(self._queue)
         yield out
 
-    # In: the events of the next instant
+    # In
 
     def _next(self) -> list[model.Event]:
         """The events of the next instant."""
         operations, queue, out = self.operations, self._queue, self._out
-        while queue and isinstance(asked := queue[0], steps.OperationAsked) and operations.joins(asked):
+        while queue and isinstance(asked := queue[0], steps.OperationAsked) and operations.can_join(asked):
             queue.popleft()
-            out.merge(self.roster.heard(self._now, str(asked.sender)))
-            if isinstance(asked.operation, BOOKINGS):
+            out.merge(self.roster.client_active(self._now, str(asked.sender)))
+            if isinstance(asked.operation, BOOKING_OPERATIONS):
                 out.then.append(steps.BookingAsked(asked))
                 return [model.Tick()]
             out.merge(operations.take(self._now, asked))
@@ -148,15 +149,15 @@ class Leader:
                 return merge(self.roster.answered(self._now, question, message, problem))
             case steps.TokensFound(question, tokens):
                 return merge(self.roster.seen(self._now, question, tokens))
-            case steps.Happened(events):
+            case steps.CoreEvents(events):
                 return [*events]
             case steps.Shunned(token, until):
                 return merge(self.roster.shun(self._now, token, until))
             case steps.Stalled(length, ended, fresh):
-                self.roster.sight.stalled(length, ended, fresh=fresh)
+                self.roster.sight.note_stall(length, ended, fresh=fresh)
             case steps.BookingAsked(asked):
                 return merge(self._bookings.operation(*asked))
-            case steps.Again():
+            case steps.RetryBooking():
                 return merge(self._bookings.again(work))
             case steps.Kept(keep, why):
                 return merge(self._bookings.kept(keep, why))
@@ -165,34 +166,34 @@ class Leader:
             case steps.ClocksRead():
                 return merge(self._bookings.set_clock(work))
             case steps.Due.BOOKINGS:
-                self._waking = False
+                self._due_queued = False
                 return merge(self._bookings.tick())
             case steps.Reloaded():
                 return self._reload()
             case steps.Lead(recovered):
-                self._lead(recovered)
+                self._begin_term(recovered)
             case steps.Compare(state):
                 return self._compare(state)
             case steps.Name(rc):
-                self._publish([], self._all_named(rc))
+                self._publish([], self._names_in_a_row(rc))
             case steps.ClientListed(answer):
-                return self._on_requests(answer)
+                return self._compare_listed(answer)
             case steps.ClientFound(number, there):
-                merge(self.operations.found(self._now, number, there=there))
+                merge(self.operations.new_client_found(self._now, number, there=there))
                 return self.operations.events()
             case steps.Resume():
                 self._out.then += self.operations.resume()
             case steps.Due.DEADLINES:
                 return self._tick()
             case steps.Due.TIME:
-                self._reports()
+                self._tick_core()
         return []
 
-    def _all_named(self, rc: RcName) -> set[RcName]:
-        """`rc`, and the RCs to be named right after it."""
+    def _names_in_a_row(self, rc: RcName) -> set[RcName]:
+        """`rc`, and the RCs of the `Name` stimuli that follow directly."""
         rcs = {rc}
-        while self._queue and isinstance(named := self._queue[0], steps.Name):
-            rcs.add(named.rc)
+        while self._queue and isinstance(name := self._queue[0], steps.Name):
+            rcs.add(name.rc)
             self._queue.popleft()
         return rcs
 
@@ -203,23 +204,23 @@ class Leader:
         out.merge(answers)
         return events
 
-    def _reports(self) -> None:
+    def _tick_core(self) -> None:
         due = self._bookings.next
-        self._waking = due is not None and due <= self._now
-        if self._waking:
+        self._due_queued = due is not None and due <= self._now
+        if self._due_queued:
             self._out.then.append(steps.Due.BOOKINGS)
         if self._core_wake is not None and self._core_wake <= self._now:
             self._decide([model.Tick()])
         self._out.merge(self.registry.tick(self._now))
 
     def _reload(self) -> list[model.Event]:
-        """The rights have changed: who has none any more holds and waits for nothing."""
+        """The rights have changed: end the ARCs of clients that have no role any more."""
         self.core.policy = self.admission.authority.bound(self._fleet.scheduling)
         known = filter(None, map(self.core.arc, self.core.arcs()))
         return [model.Tick(), *removed((arc.request for arc in known), self.admission)]
 
-    def _lead(self, recovered: RecoveredState) -> None:
-        """Begin with what was recovered."""
+    def _begin_term(self, recovered: RecoveredState) -> None:
+        """Begin the term with the recovered holds and requests."""
         now, registry, places = self._now, self.registry, self.admission.places
         joined = self.roster.start(now, recovered.rcs.values(), recovered.pending, patient=recovered.patient)
         for arc in recovered.given_up:
@@ -229,7 +230,7 @@ class Leader:
             registry.enter(request.arc, request.name)
             self.roster.expect(now, request.client)
             if request.client not in recovered.answered:
-                self._recover(request)
+                self._await_list(request)
         for arc, (grant, rcs) in recovered.believed.items():
             registry.believe(arc, grant, rcs)
         bookings = self._bookings
@@ -240,18 +241,18 @@ class Leader:
         )
         booked = bookings.recovered({request.booking for request in requests if request.booking} | recovered.booked)
         gone = removed((hold.request for hold in recovered.holds), self.admission)
-        # RCs receive the new term first; full lists end whatever was found to be half a gang.
-        self._decide([*self._out.merge(joined), *booked, lead, *gone], named=recovered.rcs)
+        # RCs receive the new term first; their full lists of holders end incomplete gangs.
+        self._decide([*self._out.merge(joined), *booked, lead, *gone], extra_rcs=recovered.rcs)
         self._out.notices += [registry.refuse(now, *refused) for refused in recovered.refused]
         for arc in self.core.arcs():
-            self._bind(arc)
+            self._bind_place(arc)
             if (expecting := recovered.expected.get(request_id(arc))) is not None:
                 places.allow_claims(arc, expecting)
 
     def _compare(self, state: messages.RcState) -> list[model.Event]:
-        """Makes an RC and the core agree: what the RC lost has ended, what is too much there is revoked."""
+        """Make an RC and the core agree: end holds that the RC lost, revoke holds that it should not have."""
         rc = state.rc
-        current = state.term == self.term and state.seq >= self._named.get(rc, 0)
+        current = state.term == self.term and state.seq >= self._last_seqs.get(rc, 0)
         holders = self.core.holders(rc)
         ended, superfluous = discrepancies(state, holders, self._now, current=current)
         if superfluous:
@@ -259,9 +260,9 @@ class Leader:
         events: list[model.Event] = [model.RcReported(rc, ended)] if ended else []
         return events + beginnings(state, holders, self._now, self._fleet.timing.hold_lease)
 
-    def _on_requests(self, answer: messages.ClientRequests) -> list[model.Event]:
-        """What RCs alone reported, and a client does not ask for, it gave up where no RCM heard of it; else its own
-        word is the one that counts."""
+    def _compare_listed(self, answer: messages.ClientRequests) -> list[model.Event]:
+        """Compare a client's list with its ARCs that only RCs reported: release those that it no longer lists, as no
+        RCM received its release, and take over the client's own words for the others."""
         known = self._recovered.pop(answer.client, set()) & {*self.core.arcs_of(answer.client)}
         listed = {asked.id: asked for asked in answer.requests[: self.admission.limits.max_requests_per_client]}
         events = list[model.Event]()
@@ -279,26 +280,26 @@ class Leader:
                     events.append(model.Released(arc.id, f"the leader, as it is no valid request: {error}"))
         return events
 
-    def _recover(self, request: model.ArcRequest) -> None:
-        """Has a client say whether it still asks for what RCs hold for it."""
+    def _await_list(self, request: model.ArcRequest) -> None:
+        """Ask a client for its requests, to learn if it still wants this ARC, which only RCs have reported."""
         self._recovered.setdefault(request.client, set()).add(request.arc)
         self._out.merge(self.roster.ask_requests(self._now, request.client))
 
     # Out: one instant
 
-    def _decide(self, events: Sequence[model.Event], named: Collection[RcName] | None = None) -> None:
-        """An instant in one part. RCs that are `named` are published, whatever becomes of them."""
-        if (instant := self._grant(events, named)) is not None:
+    def _decide(self, events: Sequence[model.Event], extra_rcs: Collection[RcName] | None = None) -> None:
+        """Decide an instant in one part. `extra_rcs` are published even if they did not change."""
+        if (instant := self._grant(events, extra_rcs)) is not None:
             self._publish_instant(instant)
             self._follow_up(instant)
 
-    def _grant(self, events: Sequence[model.Event], named: Collection[RcName] | None = None) -> _Instant | None:
-        """Answers and notices to programs whose ARCs are granted. Return None where nothing changes."""
+    def _grant(self, events: Sequence[model.Event], extra_rcs: Collection[RcName] | None = None) -> _Instant | None:
+        """Decide these events, and answer and notify the clients of granted ARCs. Return None if nothing changes."""
         lost = [event.client for event in events if isinstance(event, model.ClientLost)]
         for client in lost:
             self._recovered.pop(client, None)
-        if named is None and len(lost) == len(events) and not any(map(self.core.arcs_of, lost)):
-            return None  # clients that asked for nothing change nothing
+        if extra_rcs is None and len(lost) == len(events) and not any(map(self.core.arcs_of, lost)):
+            return None  # losing clients without ARCs changes nothing
         now, out, registry, operations = self._now, self._out, self.registry, self.operations
         ended = registry.ended
         events = [event for event in events if not (isinstance(event, model.Adopted) and ended(event.held.request.arc))]
@@ -308,24 +309,24 @@ class Leader:
         granted = [*filter(self.core.is_running, granted)]
         notified = operations.waiting.keys() & granted
         out.granted = operations.answers(now, granted)
-        if CONTINUED.isdisjoint(map(type, events)):
-            # Not of ARCs that had another hold until now.
+        if CONTINUING.isdisjoint(map(type, events)):
+            # An ARC that had another hold until now is notified after the publication.
             over = {effect.arc for effect in effects if isinstance(effect, (model.HoldEnded, model.Dropped))} | notified
             for arc in granted:
                 if arc not in over:
                     out.grant_notices.append(registry.notice(now, arc))
                     notified.add(arc)
-        return _Instant(events, effects, named, notified)
+        return _Instant(events, effects, extra_rcs, notified)
 
     def _publish_instant(self, instant: _Instant) -> None:
         self._out.reopened, self.registry.traced = self.registry.traced, []
-        self._publish(instant.effects, instant.named, self.operations.instant.left)
+        self._publish(instant.effects, instant.extra_rcs, self.operations.instant.left)
 
     def _follow_up(self, instant: _Instant) -> None:
-        """What an instant leads to beside its grants and its publication."""
+        """Everything that follows from an instant after its grants and publication."""
         events, effects, _, notified = instant
         now, out, registry, operations = self._now, self._out, self.registry, self.operations
-        self._note(events)
+        self._record(events)
         answered = notified | operations.waiting.keys()
         out.notices += registry.report(now, effects, answered, operations.instant.given_up)
         out.merge(operations.decided(now, effects))
@@ -334,7 +335,7 @@ class Leader:
                 case model.Dropped(arc=arc, outcome=outcome) | model.HoldEnded(arc=arc, outcome=outcome) if (
                     not self.core.is_open(arc)
                 ):
-                    self.admission.places.end(arc, now, KEPT.get(outcome, REMEMBERED))
+                    self.admission.places.end(arc, now, PLACE_KEPT.get(outcome, REMEMBERED))
                 case model.Propose():
                     out.proposals.append(self._bookings.proposal(effect))
                 case model.WakeAt(at):
@@ -344,35 +345,35 @@ class Leader:
             out.log.append(line)
         out.over, registry.traced = registry.traced, []
 
-    def _note(self, events: Iterable[model.Event]) -> None:
-        """What is remembered of an instant."""
+    def _record(self, events: Iterable[model.Event]) -> None:
+        """Update owners of places, history and awaited clients by the events of an instant."""
         now = self._now
         for event in events:
             match event:
                 case model.Requested(request):
                     self.roster.expect(now, request.client)
-                    self._bind(request.arc)
+                    self._bind_place(request.arc)
                     asked = f"asked for {', '.join(sorted(request.needs))} at priority {request.priority}"
                     self.registry.record(now, request.arc, asked)
                 case model.PlaceShown(arc) | model.Vouched(model.ArcRequest(arc=arc)):
-                    self._bind(arc)
+                    self._bind_place(arc)
                 case model.HandedOver(to=client, renamed=arc):
                     self.roster.expect(now, client)
-                    self._bind(arc)
+                    self._bind_place(arc)
                     if (moved := self.core.arc(arc)) is not None and not moved.vouched:
-                        self._recover(moved.request)
+                        self._await_list(moved.request)
                 case model.Adopted(model.RecoveredHold(model.ArcRequest(client=client) as request)) if self.core.arc(
                     request.arc
                 ):
-                    self._bind(request.arc)
+                    self._bind_place(request.arc)
                     self.registry.enter(request.arc, request.name)
                     if client not in self.roster.clients:
-                        # As the links to its RCs came back just now, so may its own.
-                        self._out.merge(self.roster.heard(now, client))
+                        # The links to its RCs returned just now, and the client's own may as well.
+                        self._out.merge(self.roster.client_active(now, client))
                         self.roster.expect(now, client)
-                    self._recover(request)
+                    self._await_list(request)
 
-    def _bind(self, arc: ArcId) -> None:
+    def _bind_place(self, arc: ArcId) -> None:
         if (place := self.core.place_of(arc)) is not None:
             self.admission.places.bind(place, arc, self._now)
 
@@ -381,9 +382,8 @@ class Leader:
     def _publish(
         self, effects: Iterable[model.Effect], rcs: Collection[RcName] | None = None, left: Collection[ArcId] = ()
     ) -> None:
-        """Publishes all holders of the RCs that were granted or revoked, if any were and as far as they have joined;
-        with `rcs` in any case, and those of `rcs` as well. `left`: ARCs whose programs are gone by their own client's
-        word."""
+        """Publish all holders of the granted or revoked RCs that have joined, if there are any. With `rcs`, publish in
+        any case, and the holders of `rcs` too. `left`: ARCs whose own client reported that the program is gone."""
         changed = [e for e in effects if isinstance(e, (model.Granted, model.HoldTimed, model.HoldEnded))]
         if not changed and rcs is None:
             return
@@ -396,15 +396,15 @@ class Leader:
             elif isinstance(effect, model.Granted) and effect.waited is not None:
                 begun.append((effect.grant.seq, effect.waited / SECOND))
         number = self.core.seq if self.core.seq > self.seq else self.core.number()
-        # One that has not joined holds what is not known here: to name it would end that.
+        # Holds of an RC that has not joined are unknown here, and a publication of its holders would end them.
         names = sorted({*(rcs or ()), *filter(self.roster.has_joined, concerned)})
-        self._named |= dict.fromkeys(names, number)
+        self._last_seqs |= dict.fromkeys(names, number)
         holders = {name: holders_of(self.core.holders(name), name, now) for name in names}
         instances = {rc: instance for rc, (instance, _) in self.roster.named(names).items()}
         self._out.publication = self._grants(number, holders, revoked, instances, begun)
 
     def heartbeat(self, now: Ns) -> messages.Grants:
-        """Repeats the last number."""
+        """A publication without changes: it repeats the last number."""
         self._now = now
         self._bookings.at(now)
         return self._grants(self.seq, {}, [], {}, [])
@@ -418,8 +418,8 @@ class Leader:
         begun: list[tuple[int, float]],
     ) -> messages.Grants:
         now, charged, patience = self._now, dict[str, float](), None
-        if now >= self._charged + CHARGED_EVERY:
-            self._charged, charged, patience = now, self.core.charged(), self.core.patience / SECOND or None
+        if now >= self._usage_published + USAGE_PERIOD:
+            self._usage_published, charged, patience = now, self.core.charged(), self.core.patience / SECOND or None
         every, time, age = self._fleet.timing.heartbeat / SECOND, self._bookings.time, self._bookings.age
         before, self.seq, self.published = self.seq, number, now
         known = rcs, revoked, instances, begun, time, age, charged, patience

@@ -1,7 +1,7 @@
 """Operations of clients: they become events of the core, and are answered once the core has decided. Pure.
 
-What one step takes in is one instant: one pass decides it and one publication has it. Operations on one ARC stay in
-their order: the second one waits for the next step."""
+All operations of one step are one instant, decided in one pass and published together. Of two operations on one ARC
+the second waits for the next step."""
 
 from __future__ import annotations
 
@@ -33,9 +33,9 @@ from zscout.scheduling.runtimes import RuntimeEstimator
 from zscout.types import SECOND, ArcId, ClientId, Ns, Place
 
 REPLY_SLACK: Final[Ns] = SECOND // 10
-"""After an overdue vote the first answer is given all the same."""
+"""The first answer waits this much longer than votes may take."""
 MAX_BATCH = 64
-"""Operations that are decided together at most."""
+"""Operations in one instant, and operations that are deferred, at most."""
 
 
 class _Due(Enum):
@@ -43,8 +43,8 @@ class _Due(Enum):
     RESUME = auto()
 
 
-class _Standing(NamedTuple):
-    """An ask whose answer is how its ARC stands after the instant, votes or not."""
+class _StateAsk(NamedTuple):
+    """An Ask that is answered with the ARC's state after the instant, even if votes are missing."""
 
     ticket: Ticket
     arc: ArcId
@@ -53,23 +53,23 @@ class _Standing(NamedTuple):
 
 @dataclass(slots=True)
 class _Instant:
-    """Operations that are gathered for one instant."""
+    """Operations gathered for one instant."""
 
     touched: set[ArcId] = field(default_factory=set)
     ended: list[model.Cancelled | model.Released] = field(default_factory=list)
     shown: list[model.Event] = field(default_factory=list)
     asked: list[model.Requested] = field(default_factory=list)
-    standing: list[_Standing] = field(default_factory=list)
+    state_asks: list[_StateAsk] = field(default_factory=list)
     moved: tuple[Ticket, list[ArcId]] | None = None
-    """A hand-over: it is alone."""
+    """A hand-over and the ARCs that it moves: it has an instant to itself."""
     given_up: set[ArcId] = field(default_factory=set)
-    """ARCs that end by their own client's will."""
+    """ARCs that their own clients end."""
     left: set[ArcId] = field(default_factory=set)
-    """Those whose programs are gone: a client that started anew gives up what its former life may use yet."""
+    """ARCs whose programs have ended as well, which a restarted client can't know about its former programs."""
 
 
 class Operations:
-    """Checks operations, gathers those of an instant, and keeps the tickets that wait for their answer."""
+    """Checks operations, gathers an instant of them, and keeps the tickets of operations without an answer."""
 
     def __init__(
         self,
@@ -90,18 +90,18 @@ class Operations:
         self._out = Outbox()
         self.instant = _Instant()
         self.waiting: dict[ArcId, list[Ticket]] = {}
-        """Operations that are not answered yet, by ARC."""
+        """By ARC: operations without an answer yet."""
         self._deferred: list[OperationAsked] = []
-        """Asked by clients that believe to hold, or handed over by them, while their RCs have not said so."""
-        self._moving: dict[int, tuple[Ticket, HandOver, ClientId, ClientId]] = {}
-        """Hand-overs that wait until it is known whether their new client is there, by number."""
-        self._moved = 0
+        """Operations of clients that believe in holds which RCs may yet report."""
+        self._hand_overs: dict[int, tuple[Ticket, HandOver, ClientId, ClientId]] = {}
+        """By number: hand-overs whose new client is looked for."""
+        self._hand_over_count = 0
         self._deadlines: Deadlines[tuple[_Due, Any]] = Deadlines()
 
     # In
 
-    def joins(self, asked: OperationAsked) -> bool:
-        """Return True if an operation can be part of the instant that is gathered."""
+    def can_join(self, asked: OperationAsked) -> bool:
+        """Return True if an operation can join the instant that is being gathered."""
         instant, operation = self.instant, asked.operation
         if not instant.touched:
             return True
@@ -118,7 +118,7 @@ class Operations:
         return False
 
     def take(self, now: Ns, asked: OperationAsked) -> Outbox:
-        """Take an operation in."""
+        """Add an operation to the instant, or answer, defer or refuse it at once."""
         self._now = now
         ticket, sender, operation = asked
         client = str(sender)
@@ -141,18 +141,18 @@ class Operations:
         return out
 
     def events(self) -> list[model.Event]:
-        """The events of the instant: first ends, then what is asked."""
+        """The events of the instant: ends come first, new requests last."""
         return [*self.instant.ended, *self.instant.shown, *self.instant.asked]
 
     def resume(self) -> list[OperationAsked]:
-        """The operations of clients that believe to hold, to be looked at again."""
+        """The deferred operations, to be taken again."""
         deferred, self._deferred = self._deferred, []
         return deferred
 
-    def found(self, now: Ns, number: int, *, there: bool) -> Outbox:
-        """It is known whether the new client of a hand-over has a token."""
+    def new_client_found(self, now: Ns, number: int, *, there: bool) -> Outbox:
+        """Carry out a hand-over whose new client is `there`, i.e. has a token; else refuse it."""
         self._now = now
-        ticket, operation, sender, to = self._moving.pop(number)
+        ticket, operation, sender, to = self._hand_overs.pop(number)
         try:
             if not there:
                 raise Refused("unknown_client", f"{to} is not on the mesh")
@@ -167,7 +167,7 @@ class Operations:
         return self._deadlines.next
 
     def tick(self, now: Ns) -> Outbox:
-        """First answers that are due, and operations to be looked at again."""
+        """First answers that are due, and deferred operations."""
         out = Outbox()
         while (due := self._deadlines.pop_due(now)) is not None:
             match due:
@@ -180,7 +180,7 @@ class Operations:
     # Out: the instant is decided
 
     def decided(self, now: Ns, effects: Iterable[model.Effect]) -> Outbox:
-        """The other answers that an instant has decided, and what new clients of ARCs are to know."""
+        """The answers of an instant other than to grants, and notices to the new clients of ARCs handed over."""
         out, arcs = Outbox(), list[ArcId]()
         for effect in effects:
             match effect:
@@ -190,14 +190,14 @@ class Operations:
                     arcs.append(arc)
         done, self.instant = self.instant, _Instant()
         out.answers = self.answers(now, arcs + [event.arc for event in done.ended])
-        out.answers += [(ticket, self._standing(now, arc, ask)) for ticket, arc, ask in done.standing]
+        out.answers += [(ticket, self._state_of(now, arc, ask)) for ticket, arc, ask in done.state_asks]
         if done.moved is not None:
             ticket, moved = done.moved
             out.notices = self._registry.present(now, filter(self.core.is_queued, moved))
             out.answers.append((ticket, self._registry.notice(now, moved[0])))
         undecided = [event.request.arc for event in done.asked if event.request.arc in self.waiting]
         if undecided:
-            # Votes are out: they decide the first answer, if they come.
+            # Votes are missing. They decide the first answer if they arrive in time.
             self._deadlines.set(now + self._first_answer, (_Due.FIRST_ANSWER, undecided))
         return out
 
@@ -231,13 +231,13 @@ class Operations:
         elif self._registry.ended(arc) and not self._registry.reopens(arc, ask.grant if ask.unserved else None):
             answers.append((asked.ticket, self._registry.notice(now, arc)))
         elif ask.place is not None and any(request_id(arc) == ask.id for arc in self.core.at_place(ask.place)):
-            # Another client has it: what one RCM handed over, the next knows by its place only.
+            # An earlier RCM handed it over to another client: this RCM recognises it by its place only.
             answers.append((asked.ticket, self._registry.handed_over(arc, ask.arc)))
         else:
             self._enter(asked.ticket, ask, sender, client, arc)
 
     def _check_term(self, ask: Ask, sender: Sender, client: ClientId) -> None:
-        """Raises Refused for one from a later term: this leader steps down, if that counts."""
+        """Raises Refused if the request shows a later term, for which this leader steps down if it is believed."""
         place = ask.place
         if (
             place is not None
@@ -252,10 +252,10 @@ class Operations:
             raise Refused("old_term", f"{sender} has promised a higher term", ask.term)
 
     def _ask_again(self, ticket: Ticket, ask: Ask, sender: Sender, client: ClientId, arc: ArcId) -> None:
-        """The ARC is open: the answer is how it stands, once what its client shows is known."""
+        """Answer for an open ARC with its state, after the instant has taken in what its client reports, if anything."""
         instant = self.instant
         self._registry.enter(arc, ask.arc, estimate=ask.estimate)
-        place, known, shown = self._own_place(ask, client), self.core.arc(arc), list[model.Event]()
+        place, known, shown = self._owned_place(ask, client), self.core.arc(arc), list[model.Event]()
         if known is not None and not known.vouched:
             shown.append(vouched(known, Listed(self._admission.form(ask, sender), place), self._admission))
         elif place is not None:
@@ -267,18 +267,17 @@ class Operations:
         if shown:
             instant.touched.add(arc)
             instant.shown += shown
-            instant.standing.append(_Standing(ticket, arc, ask))
+            instant.state_asks.append(_StateAsk(ticket, arc, ask))
         else:
-            self._out.at_once.append((ticket, self._standing(self._now, arc, ask)))
+            self._out.at_once.append((ticket, self._state_of(self._now, arc, ask)))
 
     def _enter(self, ticket: Ticket, ask: Ask, sender: Sender, client: ClientId, arc: ArcId) -> None:
-        """Takes a new request. This is the way of every grant: nothing is done here that can be done once it is
-        answered."""
+        """Take a new request. All grants pass here, so anything that can follow the answer is left for later."""
         instant, request = self.instant, self._admission.admit(ask, sender, self)
         if ask.booking:
             request = self._bookings.dated(replace(request, booking=self._bookings.take_up(ask, sender)))
         place, since = None, None
-        if ask.place is not None and (place := self._own_place(ask, client)) is not None:
+        if ask.place is not None and (place := self._owned_place(ask, client)) is not None:
             since = self._now - round(ask.waited * SECOND)
         elif ask.check and ask.place is None and ask.grant is None:
             self._device_check.check(self._now, ask.needs, waits=ask.wait_for_device)
@@ -286,8 +285,8 @@ class Operations:
         instant.touched.add(arc)
         instant.asked.append(model.Requested(request, place, since))
         if self._may_hold(arc, ask):
-            # It ends what it began under that grant before anybody is asked for a vote.
-            instant.standing.append(_Standing(ticket, arc, ask))
+            # Answered without waiting for votes, so that its client ends what it runs under that grant.
+            instant.state_asks.append(_StateAsk(ticket, arc, ask))
             return
         if place is not None and ask.was is not None and ask.was != ask.id:
             before = arc_id(client, ask.was)
@@ -296,8 +295,8 @@ class Operations:
                 instant.ended.append(model.Released(before, f"its client, which asks for it as {ask.id}"))
         self.waiting.setdefault(arc, []).append(ticket)
 
-    def _own_place(self, ask: Ask, client: ClientId) -> Place | None:
-        """The place that a request shows, if it is its client's. Raises Refused for one that can't be."""
+    def _owned_place(self, ask: Ask, client: ClientId) -> Place | None:
+        """The place that a request shows, if its client owns it. Raises Refused for an impossible place."""
         if ask.place is None:
             return None
         places = self._admission.places
@@ -305,14 +304,14 @@ class Operations:
         seen = client in self._roster.clients
         if places.may_claim(ask.place, client, ask.was or ask.id, ask.seal, seen=seen):
             if places.is_unproven(ask.place):
-                text = f"{client} shows a place of term {ask.place.term.counter} that is not known here: it has it"
+                text = f"{client} shows an unknown place of term {ask.place.term.counter}: accepted without proof"
                 self._out.strange.append((client, text))
             return ask.place
-        self._out.strange.append((client, f"{client} shows a place that is not its own: it has none for that"))
+        self._out.strange.append((client, f"{client} shows a place that it does not own: ignored"))
         return None
 
     def _may_hold(self, arc: ArcId, ask: Ask) -> bool:
-        """Whether its client believes in a grant of an earlier RCM of which this one does not know."""
+        """Return True if its client believes in a grant of an earlier RCM that is unknown here."""
         known = self.core.arc(arc)
         return self._believes(ask) and (known is None or known.hold is None) and not self._registry.ended(arc)
 
@@ -321,8 +320,8 @@ class Operations:
         return ask.grant is not None and ask.grant.term < self.core.term and not (ask.unconfirmed or ask.unserved)
 
     def _denied(self, arc: ArcId, ask: Ask, sender: Sender) -> model.Vouched | None:
-        """The word of a client that believes in another grant of an earlier RCM than an RC has reported, and for other
-        RCs; None: it is not so."""
+        """The client's own request, if it denies the hold that an RC reported: it believes in another grant of an
+        earlier RCM, for other RCs. None: it does not."""
         known = self.core.arc(arc)
         if known is None or known.vouched or known.hold is None or known.hold.grant == ask.grant:
             return None
@@ -331,8 +330,8 @@ class Operations:
         word = vouched(known, Listed(self._admission.form(ask, sender), None), self._admission)
         return word if word.bound is None else None
 
-    def _standing(self, now: Ns, arc: ArcId, ask: Ask) -> Notice:
-        """How an open ARC stands, for a client that may not have heard how its last hold ended."""
+    def _state_of(self, now: Ns, arc: ArcId, ask: Ask) -> Notice:
+        """The state of an open ARC, with the end of its last hold if its client may have missed that notice."""
         if ask.grant is not None and not ask.unconfirmed and not ask.unserved and self.core.is_queued(arc):
             return self._registry.interrupted(now, arc, ask.grant)
         return self._registry.notice(now, arc)
@@ -347,7 +346,7 @@ class Operations:
         owner = client_of(operation.client) if operation.client is not None else sender
         authority = self._admission.authority
         if owner.host != sender.host:
-            authority.check_operator(sender, f"end what is {owner}'s")
+            authority.check_operator(sender, f"end a request of {owner}")
         arc, instant = arc_id(str(owner), operation.id), self.instant
         if owner == sender:
             instant.given_up.add(arc)
@@ -362,7 +361,7 @@ class Operations:
         instant.ended.append(event(arc, by))
         self.waiting.setdefault(arc, []).append(ticket)
 
-    # Open requests, as limits and quotas count them: those of this instant included
+    # Open requests, as limits and quotas count them: with the requests of this instant
 
     @property
     def waiting_now(self) -> int:
@@ -374,15 +373,15 @@ class Operations:
     def of_owners(self, names: Collection[str], *but: ArcId) -> int:
         owned = sum(map(self.core.count_of_owner, names))
         owned += sum(event.request.owner in names for event in self.instant.asked)
-        its = filter(None, map(self.core.arc, but))
-        return owned - sum(arc.request.owner in names for arc in its)
+        excluded = filter(None, map(self.core.arc, but))
+        return owned - sum(arc.request.owner in names for arc in excluded)
 
     def held_by(self, names: Collection[str], *but: ArcId) -> int:
         """The number of RCs held by these owners."""
         arcs = filter(None, map(self.core.arc, {*self.core.arcs_of_owners(names)} - {*but}))
         return sum(len(arc.needs) for arc in arcs if arc.hold is not None)
 
-    # Trying dry
+    # Dry runs
 
     def _forecast(self, ticket: Ticket, asked: Foresee, sender: Sender) -> None:
         arc, now = arc_id(str(sender), asked.id), self._now
@@ -401,7 +400,7 @@ class Operations:
             begin_within=expected.begin_within / SECOND,
             preempts=[self._registry.name(victim) for victim in expected.preempts],
             reason=str(expected.reason or ""),
-            victims=[party_info(Party(one.arc, one.name, one.priority, one.who), now) for one in victims],
+            victims=[party_info(Party(arc.arc, arc.name, arc.priority, arc.who), now) for arc in victims],
             why=reason_info(expected.reason, now),
         )
         self._out.at_once.append((ticket, answer))
@@ -420,23 +419,23 @@ class Operations:
         if sender == to or own is None:
             self._answer_handed_over(asked.ticket, operation, sender, to)
         elif goal is not None and goal.place == own.place:
-            # An RCM before this one has carried it out: by the word of RCs the new client holds it, wherever that is.
+            # An earlier RCM carried it out: RCs report that the new client holds it, so it need not be looked for.
             self._hand_over(asked.ticket, operation, sender, to)
-        elif len(self._moving) >= MAX_BATCH:
+        elif len(self._hand_overs) >= MAX_BATCH:
             raise Refused("busy", f"{MAX_BATCH} hand-overs already wait here; try again")
         else:
-            self._moved += 1
-            self._moving[self._moved] = asked.ticket, operation, sender, to
-            self._out.merge(self._roster.seek(self._now, to, self._moved))
+            self._hand_over_count += 1
+            self._hand_overs[self._hand_over_count] = asked.ticket, operation, sender, to
+            self._out.merge(self._roster.find_client(self._now, to, self._hand_over_count))
 
     def _hand_over(self, ticket: Ticket, operation: HandOver, sender: ClientId, to: ClientId) -> None:
-        """All in one instant, and so in one publication: nobody gets in between."""
-        moves = self._moves(operation, sender, to)
+        """Hand over all its ARCs in one instant and one publication, so that no other request gets them in between."""
+        moves = self._arcs_to_move(operation, sender, to)
         if not moves or moves[0].arc != arc_id(sender, operation.id):
             self._answer_handed_over(ticket, operation, sender, to)
             return
         arcs = [arc for move in moves if (arc := self.core.arc(move.arc)) is not None]
-        # An ARC that is open at its new client already is replaced by the one that comes.
+        # ARCs that the new client has open under the same ids are replaced.
         replaced = [move.renamed for move in moves if self.core.is_open(move.renamed)]
         self._admission.check_hand_over(client_of(sender), client_of(to), arcs, replaced, self)
         for move in moves:
@@ -452,8 +451,8 @@ class Operations:
         instant.moved = ticket, [move.renamed for move in moves]
         instant.touched |= {move.arc for move in moves}
 
-    def _moves(self, operation: HandOver, sender: ClientId, to: ClientId) -> list[model.HandedOver]:
-        """What a hand-over comes to: of the ARCs that it names, those that are open at the sender."""
+    def _arcs_to_move(self, operation: HandOver, sender: ClientId, to: ClientId) -> list[model.HandedOver]:
+        """The ARCs to move: of the ARCs that the operation names, those open at the sender. Raises Refused."""
         moves = []
         for name in dict.fromkeys((operation.id, *operation.others)):
             arc = self.core.arc(arc_id(sender, name))
@@ -462,18 +461,18 @@ class Operations:
             renamed = arc_id(to, name)
             taken = self.core.arc(renamed)
             if taken is not None and (taken.request.needs != arc.request.needs or taken.place < arc.place):
-                # Else it is the same: its new client has asked for it, and could not prove that it has its place.
+                # Otherwise it is the same request: its new client asked for it, but could not prove its place.
                 raise Refused("bad_request", f"{to} already has a request {name}; use random ids")
             moves.append(model.HandedOver(arc.id, to, renamed))
         return moves
 
     def _answer_handed_over(self, ticket: Ticket, operation: HandOver, sender: ClientId, to: ClientId) -> None:
-        """Answers a hand-over that was done before. Raises Refused if it was not."""
+        """Answer a repeated hand-over. Raises Refused if it was never carried out."""
         goal = arc_id(to, operation.id)
         over = self._registry.ended(goal) and self._registry.ended(arc_id(sender, operation.id))
         if self.core.arc(goal) is None and not over:
             raise Refused("not_running", f"{operation.id} is not open at {sender}")
-        # The new client may have missed it, where the RCM changed just then.
+        # The new client may have missed its notices, if the RCM changed meanwhile.
         arcs = [arc_id(to, name) for name in (operation.id, *operation.others)]
         self._out.notices += self._registry.present(self._now, arcs)
         self._out.at_once.append((ticket, self._registry.notice(self._now, goal)))

@@ -1,10 +1,10 @@
-"""What is in force when a new RCM takes the lead, from the answers of RCs and clients; and what RCs hold that join
-later. Pure.
+"""Recovers holds and requests when a new RCM takes the lead, from the answers of RCs and clients; and adopts the holds
+of RCs that join later. Pure.
 
-RCs know the holds, clients their requests and places. A hold is recovered if every RC of its gang is there and holds it
-under the same grant; one that an RC of the gang does not hold is broken, and queued again with its place. While an RC
-of the gang has not answered, the others are pending (`membership.py`). What a client that answers does not ask for any
-more is not carried on: it gave it up while nobody led.
+RCs know the holds, clients their requests and places. A hold is recovered if all RCs of its gang report it under the
+same grant; if one of them reports that it does not hold it, the gang is broken, and its request queued again with its
+place. While an RC of the gang has not answered, the others are pending (`roster.py`). A hold that its client no longer
+lists is not recovered: the client released it while there was no leader.
 
 With certificates an RC is trusted for the grant, its RCs and the remaining time; its client for the rest.
 """
@@ -33,18 +33,18 @@ from zscout.messages import (
     duration,
     exact_amounts,
 )
-from zscout.rcm.admission import Admission, LetIn, binding
+from zscout.rcm.admission import Admission, Admitted, binding
 from zscout.rcm.places import arc_id, request_id
 from zscout.scheduling.model import Adopted, ArcRequest, ArcStatus, RecoveredHold, Released, Requested, Vouched
 from zscout.types import NO_TERM, SECOND, ArcId, ClientId, Grant, HostName, Need, Ns, Params, Place, RcName
 
 LONGEST_LEASE: Final[Ns] = 60 * SECOND
-"""Bounds what an RC reports of its beginning."""
+"""The hold lease that bounds the time to begin which an RC reports."""
 REMOVED: Final = "the fleet file, which names its owner under no role"
 
 
-class NotLetIn(NamedTuple):
-    """A listed request, refused as an Ask would be."""
+class RefusedRequest(NamedTuple):
+    """A listed request that is refused, as an Ask would be."""
 
     arc: ArcId
     name: str
@@ -53,28 +53,28 @@ class NotLetIn(NamedTuple):
 
 @dataclass(slots=True)
 class RecoveredState:
-    """What was in force when the lead was taken: the RCs that promised, holds, queue."""
+    """The results of a takeover: the RCs that promised, holds, queue."""
 
     rcs: dict[str, RcState] = field(default_factory=dict)
     pending: list[RcState] = field(default_factory=list)
-    """What those RCs hold they hold together with others that have not answered, which may come a little later."""
+    """RCs that hold ARCs together with RCs which have not answered, and which may answer a little later."""
     patient: bool = False
-    """Whether links may be coming back, so that those others have a lease to answer, seen or not."""
+    """True if links may be returning, so that those others have a lease to answer, with or without tokens."""
     given_up: set[ArcId] = field(default_factory=set)
-    """Of that, what its client does not ask for any more."""
+    """ARCs of pending RCs that their clients no longer list."""
     holds: list[RecoveredHold] = field(default_factory=list)
     waiting: list[Requested] = field(default_factory=list)
     expected: dict[str, set[ClientId]] = field(default_factory=dict)
-    """By request id: the clients to which it is to be handed over, as they say."""
+    """By request id: the clients that expect it to be handed over to them."""
     believed: dict[ArcId, tuple[Grant, Sequence[RcName]]] = field(default_factory=dict)
-    """Of what waits: the grant in which its client believes, and its RCs. They may not have answered yet."""
+    """By waiting ARC: the grant in which its client believes, and its RCs. They may not have answered yet."""
     answered: set[ClientId] = field(default_factory=set)
-    """The clients that have said what they ask for."""
+    """The clients that have listed their requests."""
     charged: Mapping[str, float] = field(default_factory=dict)
-    """By group: what it lately had, as the leader before told (`fair_shares.py`)."""
+    """Recent usage per group, as the previous leader published it (`fair_shares.py`)."""
     patience: Ns | None = None
-    """As the leader before published it."""
-    refused: list[NotLetIn] = field(default_factory=list)
+    """As the previous leader published it."""
+    refused: list[RefusedRequest] = field(default_factory=list)
     booked: set[str] = field(default_factory=set)
     """Dates of bookings that only RCs report as taken up: they do not lapse meanwhile."""
     remarks: list[str] = field(default_factory=list)
@@ -82,7 +82,7 @@ class RecoveredState:
 
 
 def aged(state: RcState, by: Ns) -> RcState:
-    """What an RC answered that long ago, as it would answer now."""
+    """The answer that an RC gave `by` ago, with its times brought forward to now."""
     return replace(state, holders=[_aged(holder, by / SECOND) for holder in state.holders])
 
 
@@ -94,12 +94,12 @@ def _aged(holder: Holder, by: float) -> Holder:
 
 
 def begin_within(state: RcState) -> Ns | None:
-    """The longest time from a grant until an RC has begun, without what settles; None: it does not say."""
+    """The longest time from a grant until an RC has begun, without settling; None: the RC does not report it."""
     return None if state.begin_within is None else round(state.begin_within * SECOND)
 
 
 def longest_begin(state: RcState, hold_lease: Ns) -> Ns:
-    """After this an RC that says how long it begins must have begun, whatever settled before."""
+    """The time after which an RC must have begun, with settling included."""
     return (begin_within(state) or 0) + hold_lease + round((state.settle or 0) * SECOND)
 
 
@@ -111,22 +111,24 @@ def take_over(
     home_of: Callable[[RcName], HostName | None] = lambda _: None,
     record_of: Callable[[str], BookingRecord | None] = lambda _: None,
 ) -> RecoveredState:
-    """What a new leader recovers. RCs whose gangs have not all answered are `pending`: their holds are not decided.
-    `home_of`: the host at which the fleet file has an RC; one that is free elsewhere is taken in later, as its device
-    may still be used at home. `record_of`: the known record of a booking."""
+    """Recover the state for a new leader. RCs whose gangs have not all answered are `pending`: their holds are not
+    decided. `home_of`: the host at which the fleet file has an RC; an RC that is free elsewhere is admitted later, as
+    its device may still be in use at home. `record_of`: the known record of a booking."""
     states = [state for state in states if state.holders or home_of(state.rc) in (None, state.host)]
-    # Of two instances of one RC the one with the newest hold is meant, else the one at home.
+    # Of two instances of an RC, name the instance with the newest hold, else the one at home.
     by_host = sorted(states, key=attrgetter("host", "instance"), reverse=True)
     by_host.sort(key=lambda state: state.host == home_of(state.rc))
     answered = {state.rc: state for state in sorted(by_host, key=_newest_grant)}
     pending = {rc for rc in answered if not gangs_of(rc, answered) <= answered.keys()}
-    let_in = [state for rc, state in answered.items() if rc not in pending]
+    admitted = [state for rc, state in answered.items() if rc not in pending]
     held = [holder for rc in sorted(pending) for holder in answered[rc].holders]
-    undecided = {(arc_id(one.client, one.id), one.grant) for one in held}
-    result = recover(let_in, clients, now, admission, record_of, undecided=undecided)
+    undecided = {(arc_id(holder.client, holder.id), holder.grant) for holder in held}
+    result = recover(admitted, clients, now, admission, record_of, undecided=undecided)
     result.pending = [answered[rc] for rc in sorted(pending)]
-    asked = {one.client: {request.id for request in one.requests} for one in clients}
-    result.given_up = {arc_id(one.client, one.id) for one in held if one.id not in asked.get(one.client, {one.id})}
+    listed = {answer.client: {request.id for request in answer.requests} for answer in clients}
+    result.given_up = {
+        arc_id(holder.client, holder.id) for holder in held if holder.id not in listed.get(holder.client, {holder.id})
+    }
     return result
 
 
@@ -135,13 +137,13 @@ def _newest_grant(state: RcState) -> Grant:
 
 
 def gangs_of(rc: RcName, states: Mapping[RcName, RcState]) -> set[RcName]:
-    """`rc`, all RCs of its gangs by `states`, and all of theirs."""
+    """`rc`, the RCs that hold ARCs together with it by `states`, the RCs that hold ARCs with those, and so on."""
     found, left = set[RcName](), {rc}
     while left:
-        one = left.pop()
-        found.add(one)
-        if one in states:
-            left |= {other for holder in states[one].holders for other in holder.rcs} - found
+        member = left.pop()
+        found.add(member)
+        if member in states:
+            left |= {other for holder in states[member].holders for other in holder.rcs} - found
     return found
 
 
@@ -154,14 +156,14 @@ class Listed(NamedTuple):
     request: ArcRequest
     place: Place | None
     expects: bool = False
-    """It has no place yet: its Ask was not answered, or another client hands it over."""
+    """True if it has no place yet: its Ask was not answered, or another client hands it over."""
     waited: float = 0.0
     grant: Grant | None = None
-    """The hold that its client believes in,"""
+    """The grant in which its client believes."""
     rcs: Sequence[RcName] = ()
-    """and its RCs."""
+    """The RCs of that grant."""
     problem: Problem | None = None
-    """The reason why it may not have its place or booking."""
+    """The reason that it may not have its place or booking."""
 
 
 def _listed(
@@ -170,11 +172,11 @@ def _listed(
     admission: Admission,
     record_of: Callable[[str], BookingRecord | None],
 ) -> dict[ArcId, Listed]:
-    """The valid requests; of each client at most as many as it may have open."""
+    """The valid requests, for each client no more than it may have open. Notes the others in `result`."""
     found, most = dict[ArcId, Listed](), admission.limits.max_requests_per_client
     for answer in clients:
         if len(answer.requests) > most:
-            result.remarks.append(f"{answer.client} lists {len(answer.requests)} requests: {most} are looked at")
+            result.remarks.append(f"{answer.client} lists {len(answer.requests)} requests: only {most} are read")
         for request in islice(answer.requests, most):
             try:
                 client_of(answer.client)
@@ -183,16 +185,16 @@ def _listed(
                 found[listed.request.arc] = listed
             except Refused as refused:
                 name = request.arc if NAME.fullmatch(request.arc) else request.id
-                result.refused.append(NotLetIn(arc_id(answer.client, request.id), name, refused.problem))
+                result.refused.append(RefusedRequest(arc_id(answer.client, request.id), name, refused.problem))
             except BadName as error:
-                result.remarks.append(f"what a client lists is passed over: {error}")
+                result.remarks.append(f"ignored a listed request: {error}")
     return found
 
 
 def listed_by(
     client: ClientId, asked: OpenRequest, admission: Admission, record_of: Callable[[str], BookingRecord | None]
 ) -> Listed:
-    """Raises Refused."""
+    """The listed request with the place and booking that its client may have. Raises Refused."""
     sender = client_of(client)
     request, place, problem = admission.form(asked, sender), None, None
     try:
@@ -205,37 +207,37 @@ def listed_by(
     return Listed(request, place, asked.place is None, asked.waited, asked.grant, asked.rcs, problem)
 
 
-def _enter(
+def _admit_waiting(
     result: RecoveredState,
     listed: Mapping[ArcId, Listed],
-    over: Collection[tuple[Place, str]],
+    held_places: Collection[tuple[Place, str]],
     undecided: Collection[tuple[ArcId, Grant | None]],
     now: Ns,
     admission: Admission,
 ) -> None:
-    """Admit the waiting requests as if they were asked for, the earliest places first. `over`: places and ids of
-    recovered holds. `undecided`: holds of pending RCs, which may yet continue: they are clamped instead."""
-    let_in, running = LetIn(), {held.request.arc for held in result.holds}
+    """Admit the waiting requests with the checks of an Ask, the earliest places first. `held_places`: places and ids of
+    recovered holds. `undecided`: holds of pending RCs, which may yet continue; their requests are clamped instead."""
+    admitted, running = Admitted(), {held.request.arc for held in result.holds}
     for held in result.holds:
-        let_in.add(held.request, waits=False)
+        admitted.add(held.request, waits=False)
     waiting = [known for arc, known in listed.items() if arc not in running]
     for known in sorted(waiting, key=lambda known: (known.place is None, known.place or ())):
         request = known.request
         if known.expects:
             result.expected.setdefault(request_id(request.arc), set()).add(request.client)
-        elif (known.place, request_id(request.arc)) not in over:
-            # Else it was handed over, and its client missed the answer: what the RCs hold counts.
+        elif (known.place, request_id(request.arc)) not in held_places:
+            # Otherwise it was handed over, and this client missed the answer: the hold that RCs report counts.
             try:
                 if known.problem is not None:
                     raise Refused.by(known.problem)
                 if (request.arc, known.grant) in undecided:
                     request = admission.clamped(request)
                 else:
-                    admission.check(request, let_in)
+                    admission.check(request, admitted)
             except Refused as refused:
-                result.refused.append(NotLetIn(request.arc, request.label, refused.problem))
+                result.refused.append(RefusedRequest(request.arc, request.label, refused.problem))
                 continue
-            let_in.add(request, waits=True)
+            admitted.add(request, waits=True)
             result.waiting.append(Requested(request, known.place, now - round(known.waited * SECOND)))
             if known.grant is not None:
                 result.believed[request.arc] = known.grant, known.rcs
@@ -256,24 +258,24 @@ def recover(
     known: Callable[[ArcId], ArcStatus | None] = lambda _: None,
     undecided: Collection[tuple[ArcId, Grant | None]] = (),
 ) -> RecoveredState:
-    """Combine the answers. Malformed parts are left out, and the rest is recovered. `known`: ARCs open here already;
-    `undecided`: holds of pending RCs."""
+    """Combine the answers, without malformed parts. `known`: ARCs open here already; `undecided`: holds of pending
+    RCs."""
     result = RecoveredState(rcs={state.rc: state for state in states})
-    result.answered = {one.client for one in clients}
+    result.answered = {answer.client for answer in clients}
     listed = _listed(result, clients, admission, record_of)
     parts: dict[_Reported, dict[RcName, Holder]] = {}
     for state in result.rcs.values():
         for holder in state.holders:
-            # With certificates an RC's word counts for the gang that it names, and is in.
+            # With certificates, an RC is believed for exactly the gang that it reports, if it is part of it.
             gang = tuple(sorted({*holder.rcs})) if admission.closed else ()
             if not admission.closed or state.rc in gang:
                 parts.setdefault((arc_id(holder.client, holder.id), holder.grant, gang), {})[state.rc] = holder
 
     def believed(reported: _Reported) -> tuple[bool, Grant]:
-        """The newest, but first the one that its client lists: any node may claim another."""
+        """The sort key: the hold that the client lists comes first, as any node may report another; else the newest."""
         arc, grant, gang = reported
-        mine = listed.get(arc)
-        return bool(gang) and mine is not None and mine.grant == grant and {*mine.rcs} in ({*gang}, set()), grant
+        own = listed.get(arc)
+        return bool(gang) and own is not None and own.grant == grant and {*own.rcs} in ({*gang}, set()), grant
 
     seen, places = set[ArcId](), set[tuple[Place, str]]()
     for reported, held in sorted(parts.items(), key=lambda item: believed(item[0]), reverse=True):
@@ -281,22 +283,22 @@ def recover(
         if arc in seen:
             continue
         if grant.term >= admission.places.term:
-            result.remarks.append(f"the hold of {arc} is not carried on: its grant is of no earlier term")
+            result.remarks.append(f"the hold of {arc} is not recovered: its grant is of no earlier term")
             continue
         seen.add(arc)
-        # An RC from before there were patterns passes on nothing about them.
-        some, mine = max(held.values(), key=lambda holder: len(holder.bound)), listed.get(arc)
-        if mine is None and some.client in result.answered:
+        # An RC of an old version reports no patterns.
+        some, own = max(held.values(), key=lambda holder: len(holder.bound)), listed.get(arc)
+        if own is None and some.client in result.answered:
             result.remarks.append(f"{arc} is given up by its client")
             continue
-        if mine is None and (status := known(arc)) is not None and status.vouched:
-            mine = Listed(status.request, status.place)
+        if own is None and (status := known(arc)) is not None and status.vouched:
+            own = Listed(status.request, status.place)
         try:
-            hold = _hold(arc, held, some, mine, now, admission, _waits(held, result.rcs, now))
+            hold = _hold(arc, held, some, own, now, admission, _waits(held, result.rcs, now))
         except (BadName, ValueError) as error:
-            result.remarks.append(f"the hold of {arc} is not carried on: {str(error)[:MAX_ERROR]}")
+            result.remarks.append(f"the hold of {arc} is not recovered: {str(error)[:MAX_ERROR]}")
             continue
-        # The core ends a gang with an absent RC, and names what was lost; a present RC without it breaks it.
+        # An absent RC does not break the gang here: the core ends such a hold, and names the RC that was lost.
         whole = all(name in held or name not in result.rcs for name in some.rcs)
         if whole and hold is not None:
             result.holds.append(hold)
@@ -304,11 +306,11 @@ def recover(
                 places.add((some.place, some.id))
             elif some.booking:
                 result.booked.add(some.booking)
-        elif hold is not None and not admission.closed and (mine is None or mine.expects):
+        elif hold is not None and not admission.closed and (own is None or own.expects):
             result.waiting.append(Requested(hold.request, some.place))
             listed.pop(arc, None)
-    _enter(result, listed, places, undecided, now, admission)
-    result.waiting.sort(key=lambda one: (one.place is None, one.place))
+    _admit_waiting(result, listed, places, undecided, now, admission)
+    result.waiting.sort(key=lambda asked: (asked.place is None, asked.place))
     return result
 
 
@@ -316,39 +318,40 @@ def _hold(
     arc: ArcId,
     held: Mapping[RcName, Holder],
     some: Holder,
-    mine: Listed | None,
+    own: Listed | None,
     now: Ns,
     admission: Admission,
     waits: Mapping[RcName, Ns | None],
 ) -> RecoveredHold | None:
-    """A hold as these RCs report it (`some`: the most telling of them), with the request of its client if that
-    answered; None: the client asks for something else. Raises BadName, ValueError."""
+    """The hold that these RCs report, with the request that its client lists (`own`), if it answered. `some`: the
+    report with the most details. None: the client requests something else. Raises BadName, ValueError."""
     left = round(min(holder.remaining for holder in held.values()) * SECOND)
     end = max([now, *filter(None, waits.values())]) + left
-    direct = any(holder.direct for holder in held.values()) or (mine is not None and mine.request.direct)
+    direct = any(holder.direct for holder in held.values()) or (own is not None and own.request.direct)
     bound: Mapping[Need, RcName] = some.bound
     place: Place | None = some.place
     if not admission.closed:
-        request = _told(arc, some, _needs(held, some, mine, _patterns(some)), direct=direct)
-    elif mine is None:
+        request = _reported_request(arc, some, _needs(held, some, own, _patterns(some)), direct=direct)
+    elif own is None:
         for rc in some.rcs:
             check_rc(rc)
         some = replace(some, continues="", booking="", who=None)
-        request, bound, place = _told(arc, some, _needs(held, some, None, {}), direct=direct), {}, None
+        request, bound, place = _reported_request(arc, some, _needs(held, some, None, {}), direct=direct), {}, None
     else:
-        found = binding(mine.request.needs, some.rcs, bound)
-        if found is None or not _agree(mine.request.needs, found, held):
+        found = binding(own.request.needs, some.rcs, bound)
+        if found is None or not _agree(own.request.needs, found, held):
             return None
-        request, bound = replace(mine.request, direct=direct), found
-        place = some.place if mine.expects else mine.place
+        request, bound = replace(own.request, direct=direct), found
+        place = some.place if own.expects else own.place
     request = admission.clamped(request)
-    vouched = not admission.closed or mine is not None
+    vouched = not admission.closed or own is not None
     start, protected = min(now, end - request.min_runtime), _protected_from(held, now)
     return RecoveredHold(request, place, some.grant, start, end, bound, vouched, protected, waits)
 
 
 def _waits(held: Mapping[RcName, Holder], states: Mapping[RcName, RcState], now: Ns) -> dict[RcName, Ns | None]:
-    """The RCs that have not begun, with when they begin at the latest; empty if one of them does not know of that."""
+    """The RCs that have not begun, with the latest time at which they begin; empty if the version of one of them is too
+    old to report that."""
     if any(states[rc].begin_within is None for rc in held):
         return {}
     most = {rc: longest_begin(states[rc], LONGEST_LEASE) for rc in held}
@@ -366,7 +369,7 @@ def _protected_from(held: Mapping[RcName, Holder], now: Ns) -> Ns | None:
 
 
 def _agree(needs: Mapping[Need, Params], bound: Mapping[Need, RcName], held: Mapping[RcName, Holder]) -> bool:
-    """Return True if the RCs report the parameters that the client asked for."""
+    """Return True if the RCs report the parameters that the client requested."""
     by_rc = _by_rc(needs, bound)
     return all(exact_amounts(holder.params) == by_rc[rc] for rc, holder in held.items())
 
@@ -376,17 +379,18 @@ def _by_rc(needs: Mapping[Need, Params], bound: Mapping[Need, RcName]) -> dict[R
 
 
 def _needs(
-    held: Mapping[RcName, Holder], some: Holder, mine: Listed | None, patterns: Mapping[RcName, Need]
+    held: Mapping[RcName, Holder], some: Holder, own: Listed | None, patterns: Mapping[RcName, Need]
 ) -> dict[Need, Params]:
     needs: dict[Need, Params] = {patterns.get(name, name): {} for name in some.rcs}
-    told = {rc: exact_amounts(holder.params) for rc, holder in held.items()}
-    # An absent RC's parameters are known to the client only, unless another RC meets a like pattern: those
-    # of one kind have all the same.
-    kinds = {_kind(patterns[rc]): params for rc, params in told.items() if rc in patterns}
+    """The needs of a hold, from the client's list and the RCs' reports."""
+    reported = {rc: exact_amounts(holder.params) for rc, holder in held.items()}
+    # Only the client knows an absent RC's parameters, unless another RC meets a pattern of the same kind: patterns of
+    # one kind have equal parameters.
+    kinds = {_kind(patterns[rc]): params for rc, params in reported.items() if rc in patterns}
     needs |= {need: kinds[_kind(need)] for need in patterns.values() if _kind(need) in kinds}
-    if mine is not None:
-        needs |= {need: params for need, params in mine.request.needs.items() if need in needs}
-    return needs | {patterns.get(rc, rc): params for rc, params in told.items()}
+    if own is not None:
+        needs |= {need: params for need, params in own.request.needs.items() if need in needs}
+    return needs | {patterns.get(rc, rc): params for rc, params in reported.items()}
 
 
 def _patterns(holder: Holder) -> dict[RcName, Need]:
@@ -402,8 +406,8 @@ def _patterns(holder: Holder) -> dict[RcName, Need]:
     return patterns
 
 
-def _told(arc: ArcId, holder: Holder, needs: Mapping[Need, Params], *, direct: bool) -> ArcRequest:
-    """The request in the words of an RC. Raises BadName, ValueError."""
+def _reported_request(arc: ArcId, holder: Holder, needs: Mapping[Need, Params], *, direct: bool) -> ArcRequest:
+    """The request as an RC reports it. Raises BadName, ValueError."""
     client_of(holder.client)
     check_name(holder.id, "id")
     check_name(holder.arc, "arc")
@@ -435,31 +439,32 @@ def adopted(
     admission: Admission,
     known: Callable[[ArcId], ArcStatus | None],
 ) -> tuple[list[Adopted | Released], list[str]]:
-    """The holds of late joiners that continue, and remarks for the log. `joined`: the RCs that count as there."""
+    """The holds of late joiners that continue, and remarks for the log. `joined`: the RCs that count as present."""
     well = [state for state in states if state.health == "ok"]
     held = {(state.rc, holder.grant) for state in well for holder in state.holders}
     found = recover(well, [], now, admission, known=known)
-    holds = [one for one in found.holds if all((rc, one.grant) in held or rc not in joined for rc in one.rcs)]
-    return [*map(Adopted, holds), *removed((one.request for one in holds), admission)], found.remarks
+    holds = [hold for hold in found.holds if all((rc, hold.grant) in held or rc not in joined for rc in hold.rcs)]
+    return [*map(Adopted, holds), *removed((hold.request for hold in holds), admission)], found.remarks
 
 
 def removed(requests: Iterable[ArcRequest], admission: Admission) -> list[Released]:
-    """Ends the ARCs of clients without a role."""
-    gone = [one.arc for one in requests if admission.authority.is_removed(one.client)]
+    """The events that end the ARCs of clients without a role."""
+    gone = [request.arc for request in requests if admission.authority.is_removed(request.client)]
     return [Released(arc, REMOVED) for arc in gone]
 
 
 # Late answers of clients
 
 
-def vouched(status: ArcStatus, one: Listed, admission: Admission) -> Vouched:
-    """The client's words for an ARC reported by RCs only. Raises Refused if it waits, and may not be asked for."""
+def vouched(status: ArcStatus, own: Listed, admission: Admission) -> Vouched:
+    """The event with the client's own request for an ARC that only RCs reported. Raises Refused if the ARC waits, and
+    its client may not request it."""
     if status.hold is None:
-        admission.authority.check_ask(client_of(one.request.client).host, one.request, lambda _: 0)
-    bound = binding(one.request.needs, status.needs, {})
+        admission.authority.check_ask(client_of(own.request.client).host, own.request, lambda _: 0)
+    bound = binding(own.request.needs, status.needs, {})
     if (
         bound is not None
-        and {bound.get(need, need): params for need, params in one.request.needs.items()} != status.needs
+        and {bound.get(need, need): params for need, params in own.request.needs.items()} != status.needs
     ):
         bound = None
-    return Vouched(admission.clamped(one.request), one.place, bound)
+    return Vouched(admission.clamped(own.request), own.place, bound)

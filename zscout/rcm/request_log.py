@@ -1,7 +1,7 @@
-"""The requests of one term beside the core: names, notices to their clients, recent endings, history. Pure.
+"""The facts about requests that the core does not have: names, notices to clients, recent endings, history. Pure.
 
-Every change that is not the answer to an operation is a notice on the client's key; requests that ended are remembered
-for a while. The history of each ARC is kept as text, for `zscout why` and the log."""
+Each change that no answer to an operation reports becomes a notice on the client's key. Ended requests are kept for a
+while. The history of each ARC is kept as text, for `zscout why` and the log."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from zscout.scheduling.upcoming import UpcomingEnd
 from zscout.types import SECOND, ArcId, Grant, Ns, RcName
 
 REMEMBERED: Final[Ns] = 60 * SECOND
-"""How long ended requests are known: longer than any query's timeout and a lease together."""
+"""The time for which ended requests are known: longer than any query's timeout and a lease together."""
 MAX_REMEMBERED: Final = 20_000
 FINAL: Final = (Outcome.RELEASED, Outcome.CANCELLED, Outcome.COMPLETED)
 """Outcomes of requests that are never granted again."""
@@ -47,7 +47,7 @@ MAX_LOGGED: Final = 50
 def reason_info(reason: Reason | None, now: Ns) -> ReasonInfo | None:
     if reason is None:
         return None
-    by = [party_info(one, now) for one in reason.by]
+    by = [party_info(party, now) for party in reason.by]
     rcs, patterns, detail = list(reason.rcs), list(reason.patterns), ITS_CLIENT if reason.own else reason.detail
     return ReasonInfo(reason.code, rcs, by, detail, reason.number, reason.pattern, patterns, reason.own)
 
@@ -64,21 +64,21 @@ def upcoming_info(end: UpcomingEnd, now: Ns) -> messages.Upcoming:
 
 @dataclass(slots=True)
 class _Request:
-    """What is known of an ARC beside the core."""
+    """The record of an ARC."""
 
     name: str
     estimated: bool = False
     """Its notices include when it will start."""
     ending: Notice | None = None
-    """How its last hold ended here, while it is queued; or how it ended."""
+    """The end of its last hold here, while it is queued; else its own end."""
     until: Ns | None = None
-    """It ended, and is remembered until then."""
+    """If it has ended: the time until which it is kept."""
     believed: Collection[RcName] = ()
-    """RCs that its client believes to hold since an earlier term, which may yet report that, ..."""
+    """RCs that its client believes to hold since an earlier term: they may yet report that."""
     believed_grant: Grant | None = None
-    """... and by which grant."""
-    foretold: Ns | None = None
-    """The first start that its client was notified of."""
+    """The grant of that hold."""
+    first_estimate: Ns | None = None
+    """The first estimated start that its client was notified of."""
 
 
 class RequestLog:
@@ -87,37 +87,37 @@ class RequestLog:
         self._runtimes = runtimes
         self._step = 0  # number of the last notice
         self._requests: dict[ArcId, _Request] = {}
-        self._over: OrderedDict[ArcId, None] = OrderedDict()  # those that ended, in that order
+        self._ended: OrderedDict[ArcId, None] = OrderedDict()  # ended ARCs, in the order of their ends
         self._changed: dict[ArcId, None] = {}
-        """Queued ARCs with another reason to wait than the one that was published."""
+        """Queued ARCs whose reason to wait changed since it was published."""
         self._report_at: Ns | None = None
         self._starts: Mapping[ArcId, Ns] = {}  # the last forecast
-        self._forecast: tuple[int, Ns] | None = None  # after which batch of events, and when, it was made
-        self._lines: deque[tuple[Ns, ArcId, str, str]] = deque(maxlen=MAX_LINES)  # when, ARC, its name, what happened
+        self._forecast: tuple[int, Ns] | None = None  # the batch of events and the time at which it was made
+        self._lines: deque[tuple[Ns, ArcId, str, str]] = deque(maxlen=MAX_LINES)  # time, ARC, its name, text
         self.traced: list[tuple[str, ArcId]] = []
-        """Since the caller took them: ARCs that are over for good, and those that were reopened."""
+        """ARCs that are over for good, or were reopened, since the caller took this list."""
         self._upcoming: dict[ArcId, tuple[UpcomingEnd, ...]] = {}
-        """The upcoming ends of holds that their clients were notified of last."""
-        self.foretold: dict[ArcId, Ns] = {}
-        """ARCs granted in the last instant, with the start that their clients were notified of first."""
+        """By hold: the upcoming ends in the last notice to its client."""
+        self.first_estimates: dict[ArcId, Ns] = {}
+        """ARCs granted in the last instant, with the first estimated start that their clients were notified of."""
         self._unlogged: list[str] = []
         self._log_at: Ns | None = None
 
     def enter(self, arc: ArcId, name: str, *, estimate: bool = False) -> None:
-        """Call `arc` by `name` from now on; with `estimate` its notices include when it will start."""
+        """Set the name of `arc`; with `estimate` its notices include the estimated start."""
         known = self._requests.get(arc)
         if known is None or known.until is not None:
             known = self._requests[arc] = _Request(name)
-            self._over.pop(arc, None)
+            self._ended.pop(arc, None)
         known.name = name
         known.estimated |= estimate
 
     def rename(self, arc: ArcId, renamed: ArcId) -> None:
-        """`arc` is handed over, and is `renamed` there."""
+        """`arc` is handed over, under the new id `renamed`."""
         known = self._requests.get(arc)
         self.enter(renamed, self.name(arc))
         if known is not None and self._core.is_queued(arc):
-            self._requests[renamed].foretold = known.foretold
+            self._requests[renamed].first_estimate = known.first_estimate
 
     def believe(self, arc: ArcId, grant: Grant, rcs: Collection[RcName]) -> None:
         """The client of a waiting ARC believes that it holds these RCs by this grant."""
@@ -154,8 +154,8 @@ class RequestLog:
         return believed not in (None, ended.grant) and self.may_be_held(now, ended.arc)
 
     def reopens(self, arc: ArcId, unserved: Grant | None = None) -> bool:
-        """Return True if `arc` ended only because its client seemed lost, or had its time under the grant `unserved`
-        while RCs of it settled: it may be asked for again, and is forgotten here."""
+        """Return True if `arc` may be requested again, and forget its end: it ended only because its client seemed
+        lost, or it was completed under the grant `unserved` while RCs of it settled."""
         if (notice := self._ending(arc)) is None:
             return False
         completed = notice.outcome == Outcome.COMPLETED and notice.grant is not None and notice.grant == unserved
@@ -163,7 +163,7 @@ class RequestLog:
             return False
         if completed:
             self.traced.append(("reopened", arc))
-        del self._requests[arc], self._over[arc]
+        del self._requests[arc], self._ended[arc]
         return True
 
     def give_up(self, now: Ns, arc: ArcId, outcome: Outcome) -> None:
@@ -173,7 +173,7 @@ class RequestLog:
         if known is None or notice.outcome == Outcome.CLIENT_LOST:
             self._remember(now, arc, replace(notice, outcome=outcome))
         elif notice.outcome == Outcome.COMPLETED:
-            # Nor as one whose time passed while its RCs settled.
+            # Without its grant it is not reopened as `unserved` either.
             self._requests[arc].ending = replace(notice, grant=None)
 
     # Notices
@@ -204,7 +204,7 @@ class RequestLog:
             reason=str(arc.reason or ""),
             why=reason_info(arc.reason, now),
             ahead=arc.ahead,
-            # What it is bound to is only what it was last checked with.
+            # Its patterns are bound only to the RCs of the last check, so they are left out.
             rcs=sorted(need for need in request.needs if not is_pattern(need)),
             starts_in=self._starts_in(now, arc),
             **known,
@@ -219,8 +219,8 @@ class RequestLog:
         return [upcoming_info(end, now) for end in ends]
 
     def interrupted(self, now: Ns, arc: ArcId, believed: Grant) -> Notice:
-        """The present state of a queued request whose client believes in a hold: with how that ended, or as lost where
-        not all RCs had it."""
+        """The state of a queued request whose client believes in a hold: with the end of that hold, or as lost if its
+        end is not known here."""
         known = self._requests.get(arc)
         notice, ending = self.notice(now, arc), None if known is None else known.ending
         if ending is None or ending.grant != believed:
@@ -228,7 +228,7 @@ class RequestLog:
         return replace(notice, outcome=ending.outcome, by=ending.by, reason=ending.reason, why=ending.why)
 
     def handed_over(self, arc: ArcId, name: str) -> Notice:
-        """The request continues in another client, where no more than that is known."""
+        """The notice that another client has the request now, if nothing else is known of it."""
         reason = "handed over to another client"
         return replace(self._notice(arc, "ended", reason=reason, outcome=Outcome.HANDED_OVER), arc=name)
 
@@ -253,19 +253,19 @@ class RequestLog:
     def report(
         self, now: Ns, effects: Iterable[Effect], answered: Collection[ArcId], given_up: Collection[ArcId]
     ) -> list[Notice]:
-        """The notices of an instant's effects, except where the answer to an operation says the same: the grant of an
-        `answered` ARC, the end of the hold of a `given_up` one."""
+        """The notices of an instant's effects, except those that repeat the answer to an operation: the grant of an
+        `answered` ARC, the end of the hold of a `given_up` ARC."""
         notices = []
-        self.foretold.clear()
+        self.first_estimates.clear()
         for effect in effects:
             match effect:
                 case Granted(arc=arc, rcs=rcs):
                     self.record(now, arc, f"granted {', '.join(rcs)}")
                     if (known := self._requests.get(arc)) is not None and known.until is None:
-                        if known.foretold is not None:
-                            self.foretold[arc] = known.foretold
-                        known.ending = known.foretold = None
-                    # An ARC that ended in the same instant has only that notice.
+                        if known.first_estimate is not None:
+                            self.first_estimates[arc] = known.first_estimate
+                        known.ending = known.first_estimate = None
+                    # If the ARC ended in the same instant, only its end is notified.
                     if arc not in answered and self._is_vouched(arc):
                         notices.append(self.notice(now, arc))
                 case HoldTimed(arc=arc, waits=waits) if self._core.is_running(arc):
@@ -289,7 +289,7 @@ class RequestLog:
         return notices
 
     def present(self, now: Ns, arcs: Iterable[ArcId]) -> list[Notice]:
-        """The present state of these ARCs, as far as they are open."""
+        """The notices with the present state of these ARCs, without those that are closed."""
         opened = [arc for arc in arcs if self._core.is_open(arc)]
         for arc in opened:
             self._changed.pop(arc, None)
@@ -297,7 +297,7 @@ class RequestLog:
 
     @property
     def next(self) -> Ns | None:
-        """When `tick` is due."""
+        """The time at which `tick` is due."""
         return min((at for at in (self._report_at, self._log_at) if at is not None), default=None)
 
     def tick(self, now: Ns) -> Outbox:
@@ -317,13 +317,13 @@ class RequestLog:
         return out
 
     def _upcoming_notices(self, now: Ns) -> list[Notice]:
-        """The holds that have other upcoming ends than their clients know."""
+        """The notices of holds whose upcoming ends changed since the last notice."""
         holds = (arc for arc in self._core.contended_holds() if self._is_vouched(arc))
         changed = [arc for arc in holds if self._core.upcoming(arc) != self._upcoming.get(arc, ())]
         return [self.notice(now, arc) for arc in changed]
 
     def _close(self, now: Ns, effect: HoldEnded | Dropped) -> Notice:
-        """Record how a hold, or the wait for one, ended. A request that is not queued again has ended with it."""
+        """Record the end of a hold or of a queued request. Unless it is queued again, the request has ended with it."""
         why = reason_info(effect.reason, now)
         details: dict[str, Any] = {"reason": str(effect.reason), "outcome": effect.outcome, "why": why}
         self._upcoming.pop(effect.arc, None)
@@ -346,26 +346,27 @@ class RequestLog:
         if notice.outcome in FINAL:
             self.traced.append(("over", arc))
         self._requests[arc] = _Request("", ending=notice, until=now + REMEMBERED)
-        self._over[arc] = None
-        self._over.move_to_end(arc)
-        while self._over and (len(self._over) > MAX_REMEMBERED or self._is_old(next(iter(self._over)), now)):
-            del self._requests[self._over.popitem(last=False)[0]]
+        self._ended[arc] = None
+        self._ended.move_to_end(arc)
+        while self._ended and (len(self._ended) > MAX_REMEMBERED or self._is_old(next(iter(self._ended)), now)):
+            del self._requests[self._ended.popitem(last=False)[0]]
 
     def _is_old(self, arc: ArcId, now: Ns) -> bool:
         until = self._requests[arc].until
         return until is not None and until < now
 
-    # Forecasts: one serves all that are wanted in the same instant
+    # Forecasts
 
     def starts(self, now: Ns) -> Mapping[ArcId, Ns]:
-        """When each queued ARC will start, forecast from the present state; absent: never, or too late."""
+        """By queued ARC: its start, forecast from the present state; absent: never, or too late. One forecast serves
+        the whole instant."""
         if self._forecast is None or self._forecast[0] != self._core.batches:
             self._starts = forecast(self._core, now, None, self._runtimes).starts
             self._forecast = self._core.batches, now
         return self._starts
 
     def _starts_in(self, now: Ns, arc: ArcStatus) -> float | None:
-        """Seconds until a queued ARC starts, by a forecast since it was queued and not older than FORECAST_AGE."""
+        """Seconds until a queued ARC starts, by a forecast made since it was queued and within FORECAST_AGE."""
         known = self._requests.get(arc.id)
         if arc.hold is not None or known is None or not known.estimated:
             return None
@@ -374,8 +375,8 @@ class RequestLog:
         start = (self._starts if recent else self.starts(now)).get(arc.id)
         if start is None:
             return None
-        if known.foretold is None and self._core.is_queued(arc.id):
-            known.foretold = start
+        if known.first_estimate is None and self._core.is_queued(arc.id):
+            known.first_estimate = start
         return max(0, start - now) / SECOND
 
     # History
@@ -397,7 +398,7 @@ class RequestLog:
         return lines[-MAX_ANSWERED:]
 
     def close(self, now: Ns) -> str:
-        """What was gathered for the log: nothing is published any more."""
+        """The last lines for the log, when the term is over."""
         self._record_reasons(now)
         return self._log_text()
 

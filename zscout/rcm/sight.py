@@ -23,7 +23,7 @@ class Sight:
         """Hosts whose last tokens disappeared recently, and when."""
         self._away_until: Ns = 0
 
-    def stalled(self, length: Ns, ended: Ns, *, fresh: bool) -> None:
+    def note_stall(self, length: Ns, ended: Ns, *, fresh: bool) -> None:
         """This process stalled. `fresh`: what arrived meanwhile may not be handled yet."""
         self._stall = length, ended, fresh
 
@@ -34,7 +34,7 @@ class Sight:
         self._tokens[host] += 1 if alive else -1
         return True
 
-    def stood_still(self, now: Ns) -> bool:
+    def stalled_recently(self, now: Ns) -> bool:
         """Return True if this process stalled for long, less than a lease ago."""
         length, ended, _ = self._stall
         return length > self._span and now - ended < self.lease
@@ -43,13 +43,13 @@ class Sight:
         """Return True while this leader may be away, so that tokens that disappear may still exist."""
         return now < self._away_until
 
-    def lost(self, now: Ns, host: HostName) -> bool:
+    def token_lost(self, now: Ns, host: HostName) -> bool:
         """A token of `host` disappeared. Return True if this leader may be away."""
         if not self._tokens[host]:
             self._gone.append((now, host))
         while self._gone and self._gone[0][0] < now - self._span:
             self._gone.popleft()
-        if (self._stall[2] and self.stood_still(now)) or self._lost_several:
+        if (self._stall[2] and self.stalled_recently(now)) or self._lost_several:
             self.doubt(now)
         return self.is_away(now)
 
@@ -57,7 +57,7 @@ class Sight:
         """For a lease this leader may be away."""
         self._away_until = now + self.lease
 
-    def clear(self) -> bool:
+    def host_answered(self) -> bool:
         """Another host answered. Return True if that shows that this leader is there."""
         if self._stall[2] or self._lost_several:
             return False

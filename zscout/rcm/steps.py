@@ -1,7 +1,7 @@
-"""What goes into a step of the leader, and what comes out. Pure values.
+"""Input and output of the leader's steps: stimuli and the Outbox. Pure values.
 
-Stimuli that the mesh, timers and bookings bring are queued; a step takes as many as make one instant of the core. The
-names in them were checked as they came in, those within holds and requests are checked where these enter."""
+Stimuli from the mesh, timers and bookings are queued; a step takes as many as fit in one instant of the core. Their
+names are checked on arrival; names within holds and requests are checked at admission."""
 
 from __future__ import annotations
 
@@ -36,18 +36,18 @@ Answer: TypeAlias = tuple[Ticket, Struct]
 
 
 class BookedDanger(NamedTuple):
-    """A date of a booking may not be kept, and why; empty: it is safe again. `over`: it is not kept."""
+    """The reason that a date of a booking may not be kept; empty: it is safe again. `over`: the date was not kept."""
 
     record: BookingRecord
     start: Instant
     why: str
     later: int = 0
-    """Dates after that of which the same is to be reported."""
+    """The number of later dates in the same danger."""
     over: bool = False
 
 
 class Keep(NamedTuple):
-    """Answer once a record is kept; `withdraw`: forget it where it can't be."""
+    """Have keepers store a record, then answer; `withdraw`: remove the record if storing fails."""
 
     ticket: Ticket
     booking: str
@@ -55,10 +55,10 @@ class Keep(NamedTuple):
 
 
 class Question(NamedTuple):
-    """A question to the mesh. The first answer, or none within `timeout` seconds, becomes a `QuestionAnswered`; the
-    tokens on `key`, where `kind` is None, `TokensFound`."""
+    """A question to the mesh. The first answer, or none within `timeout` seconds, becomes a `QuestionAnswered`. Without
+    `kind` it asks for the tokens on `key`, which become a `TokensFound`."""
 
-    why: Why
+    purpose: Purpose
     key: str
     timeout: float
     message: RcAsk = RcAsk()
@@ -66,15 +66,15 @@ class Question(NamedTuple):
     token: Token | None = None
     client: ClientId = ""
     number: int = 0
-    """The client's deadline, or the caller's number of `seek`."""
+    """The client's deadline, or the number of `Roster.find_client`."""
 
 
-class Why(Enum):
+class Purpose(Enum):
     PROMISE = "an RC's promise to obey this term"
     RETURN = "the state of an RC whose token is back"
     REQUESTS = "the requests of a client"
     OVERDUE = "a client without a token may answer all the same"
-    SOUGHT = "the new client of a hand-over"
+    FIND_CLIENT = "the new client of a hand-over"
     PROBE = "a client or RC whose token disappeared: an answer shows that the mesh contradicts itself"
     WITNESS = "any other host: an answer shows that this leader is not away"
 
@@ -88,26 +88,26 @@ class OperationAsked(NamedTuple):
 
 
 class Lead(NamedTuple):
-    """The first stimulus: what a takeover found."""
+    """The first stimulus: begin the term with the results of the takeover."""
 
     recovered: RecoveredState
 
 
 class TokenSeen(NamedTuple):
-    """A token of a client or an RC came or went."""
+    """A token of a client or an RC appeared or disappeared."""
 
     token: Token
     alive: bool
 
 
 class Reported(NamedTuple):
-    """An RC's state, on its own key."""
+    """An RC published its state."""
 
     state: RcState
 
 
 class QuestionAnswered(NamedTuple):
-    """The first answer to a question; neither message nor problem: there was none."""
+    """The first answer to a question; without message and problem: no answer in time."""
 
     question: Question
     message: Any = None
@@ -121,21 +121,21 @@ class TokensFound(NamedTuple):
     tokens: Sequence[Token]
 
 
-class Happened(NamedTuple):
-    """Events of the core, of one instant: ballots, dates."""
+class CoreEvents(NamedTuple):
+    """Events of one instant for the core: ballots, dates."""
 
     events: Sequence[Event]
 
 
 class Shunned(NamedTuple):
-    """An RC shows a term that is not believed: it counts as absent until then."""
+    """An RC shows a term that is not believed: it counts as absent until `until`."""
 
     token: Token
     until: Ns
 
 
 class Stalled(NamedTuple):
-    """This process stalled. `fresh`: what arrived meanwhile may not be handled yet."""
+    """This process stalled. `fresh`: messages that arrived meanwhile may not be handled yet."""
 
     length: Ns
     ended: Ns
@@ -143,23 +143,23 @@ class Stalled(NamedTuple):
 
 
 class Shared(NamedTuple):
-    """Keepers of bookings have records that were not known here."""
+    """Keepers of bookings sent records that were unknown here."""
 
 
 class ClocksRead(NamedTuple):
-    """All keepers were asked, and this was so at `at`."""
+    """The clocks of all keepers, as of `at`."""
 
     at: Ns
     heard: tuple[float, Ns] | None
-    """The oldest fleet time that others have heard, in ns since 1970, and for how many seconds it has gone on."""
+    """The fleet time that has run longest at any keeper: seconds that it has run, and ns since 1970."""
     walls: Mapping[HostName, Ns]
-    """What hosts' clocks say, likewise."""
+    """The wall clock of each host, in ns since 1970."""
     kept: frozenset[HostName]
-    """The hosts whose clocks are kept by a time service."""
+    """Hosts whose clocks a time service synchronises."""
 
 
 class Kept(NamedTuple):
-    """A record is kept, or not: `why`."""
+    """A record is stored; or not, for the reason `why`."""
 
     keep: Keep
     why: str
@@ -170,13 +170,13 @@ class Reloaded(NamedTuple):
 
 
 class Compare(NamedTuple):
-    """An RC that counts as present reports its holds: the core is to agree."""
+    """Compare the holds that a present RC reports with the core's."""
 
     state: RcState
 
 
 class Name(NamedTuple):
-    """Publish this RC, so that its instances learn which one is meant."""
+    """Publish this RC with its named instance, so that its instances learn which of them serves."""
 
     rc: RcName
 
@@ -186,7 +186,7 @@ class ClientListed(NamedTuple):
 
 
 class ClientFound(NamedTuple):
-    """By number of `Roster.seek`: whether the client has a token."""
+    """The result of `Roster.find_client` with this number: `there` is True if the client has a token."""
 
     number: int
     there: bool
@@ -196,8 +196,8 @@ class Resume(NamedTuple):
     """RCs are no longer pending."""
 
 
-class Again(NamedTuple):
-    """An operation on bookings whose votes were not all known is tried once more."""
+class RetryBooking(NamedTuple):
+    """Retry an operation on bookings that waited for votes."""
 
     undecided: Any
 
@@ -211,7 +211,7 @@ class BookingAsked(NamedTuple):
 class Due(Enum):
     DEADLINES = auto()
     TIME = auto()
-    """The core's time is over; reasons and lines of the log may be due."""
+    """The core's own deadline, notices of reasons, and lines of the log may be due."""
     BOOKINGS = auto()
 
 
@@ -222,7 +222,7 @@ Stimulus: TypeAlias = (
     | Reported
     | QuestionAnswered
     | TokensFound
-    | Happened
+    | CoreEvents
     | Shunned
     | Stalled
     | Shared
@@ -234,7 +234,7 @@ Stimulus: TypeAlias = (
     | ClientListed
     | ClientFound
     | Resume
-    | Again
+    | RetryBooking
     | BookingAsked
     | Due
 )
@@ -246,54 +246,55 @@ class Proposed(NamedTuple):
 
 
 class Outbox(Struct):
-    """What follows from a step, in the order in which it is carried out, nothing awaited in between. Each part of the
-    leader returns its share, with the events that are to be decided, and the stimuli of the next instants."""
+    """The results of a step. The shell carries out the fields in their order and awaits nothing in between. Each part
+    of the leader returns an Outbox of its own, with events for the core and stimuli for the next instants."""
 
     at_once: list[Answer] = []
-    """Answers that need no instant: refusals, and how requests stood before it."""
+    """Answers that need no decision: refusals, and states of requests before the instant."""
     higher: list[tuple[Word, Token | None]] = []
-    """Terms above the own, and for an RC that is seen its token. A leader that steps down does nothing of the rest."""
+    """Terms above this leader's, each with the token of the RC that showed it, if one did. A leader that steps down
+    for one carries out nothing more."""
     disbelieved: list[tuple[RcName, Term]] = []
     granted: list[Answer] = []
-    """Answers to requests that are granted: before anybody else learns of it."""
+    """Answers to granted requests, sent before the publication."""
     grant_notices: list[Notice] = []
     reopened: list[tuple[str, ArcId]] = []
-    """For the trace, before the publication."""
+    """Lines for the trace, written before the publication."""
     publication: Grants | None = None
     notices: list[Notice] = []
     answers: list[Answer] = []
     proposals: list[Proposed] = []
     questions: list[Question] = []
     suspicions: list[tuple[str, bool]] = []
-    """Contradictions of the mesh, and those that are over."""
+    """Contradictions of the mesh: True if it began, False if it is over."""
     events: list[Event] = []
     effects: Sequence[Effect] = ()
-    """Of the instant, for those who count holds."""
+    """The effects of the instant, for figures and notices about holds."""
     changed: list[BookingRecord] = []
-    """Records to be shared with all keepers soon."""
+    """Records to share with all keepers soon."""
     keep: list[Keep] = []
-    """Those that are kept before they are answered."""
+    """Records that must be stored before their operation is answered."""
     dangers: list[BookedDanger] = []
     drained: list[frozenset[HostName]] = []
-    """The hosts in maintenance, if they have changed; the last counts."""
+    """The hosts in maintenance, if they have changed; the last entry counts."""
     log: list[str] = []
     strange: list[tuple[str, str]] = []
-    """Warnings, each with its subject: of one subject not too many are logged."""
+    """Warnings, each with its subject: the number logged per subject is bounded."""
     duplicates: list[tuple[RcName, HostName]] = []
     """RCs that a second host offers."""
     over: list[tuple[str, ArcId]] = []
-    """For the trace."""
+    """Lines for the trace, written at the end."""
     then: list[Stimulus] = []
-    """Each an instant of its own, after this one and before those that wait: the leader takes them itself."""
+    """Stimuli of later instants: the leader takes them itself, before all that are queued."""
     wake: Ns | None = None
-    """The next step is due then at the latest."""
+    """The time at which the next step is due at the latest."""
     more: bool = False
-    """Another step is due at once: stimuli are left."""
+    """True if stimuli are left: the next step is due at once."""
     last: bool = True
-    """Whether it ends the instant: before it come its answers, and its publication."""
+    """False for the parts of an instant with its first answers and its publication."""
 
     def take(self, names: Iterable[str]) -> Outbox:
-        """Take these fields out, as a part of its own."""
+        """Move these fields into an Outbox of their own."""
         part = Outbox(last=False)
         for name in names:
             setattr(part, name, getattr(self, name))
@@ -301,7 +302,7 @@ class Outbox(Struct):
         return part
 
     def merge(self, part: Outbox) -> list[Event]:
-        """Take over all that a part lists. Its events are returned: they are to be decided."""
+        """Append the lists of `part`, and return its events, for the core."""
         if part == _NOTHING:
             return []
         for own, more in zip(_lists_of(self), _lists_of(part), strict=True):

@@ -1,8 +1,8 @@
-"""Which terms a manager believes, and which hosts it doubts. Pure: evidence goes in with its time.
+"""The terms that a manager believes, and the hosts that it doubts. Pure: evidence goes in with its time.
 
-Without `[security]` every word counts. With it a term counts if a leader shows it, a sealed place names it, or an RC
-whose token is seen obeys it; a client's word does not. A host whose RCs alone showed a term in which nobody then led
-is not believed alone for a while."""
+Without `[security]` all evidence counts. With it a term counts if a leader shows it, a sealed place names it, or an RC
+whose token is seen obeys it; a client's word does not count. A host whose RCs alone showed a term that then had no
+leader is not believed alone for a while."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from zscout.messages import absurd, of_the_last
 from zscout.types import NO_TERM, SECOND, HostName, Ns, Term
 
 DOUBT: Final[Ns] = 10 * SECOND
-"""A host is doubted for so long, and each further time for twice as long."""
+"""The length of the first doubt of a host; each further doubt is twice as long."""
 MAX_DOUBLINGS: Final = 8
 MAX_TRIED: Final = 64
 FORGIVEN_AFTER: Final[Ns] = 3_600 * SECOND
-"""From the end of a doubt: the next is as long as the first."""
+"""If the last doubt ended longer ago than this, the next has the first length again."""
 
 
 class Source(Enum):
-    """Where a term was shown."""
+    """The kind of evidence for a term."""
 
     LEADER = auto()
     """A publication on `rcm/grants`, or an answer of `rcm/state`."""
@@ -31,7 +31,7 @@ class Source(Enum):
     RC = auto()
     """An RC obeys it."""
     CLIENT = auto()
-    """A client obeys it, by its own word."""
+    """A client reports that it obeys it."""
 
 
 class Word(NamedTuple):
@@ -46,11 +46,11 @@ class Word(NamedTuple):
 class Verdict(NamedTuple):
     believed: bool
     absent_until: Ns = 0
-    """An RC that shows a term which is not believed counts as absent until then."""
+    """If the term of an RC is not believed: the time until which the RC counts as absent."""
     why: str = ""
-    """For the log, where it is worth a line."""
+    """A line for the log, if any."""
     last: bool = False
-    """It is one of the last terms: another witness is needed."""
+    """True if the term is one of the last possible ones, so that another witness is needed."""
 
 
 BELIEVED: Final = Verdict(believed=True)
@@ -58,7 +58,7 @@ IGNORED: Final = Verdict(believed=False)
 
 
 class _Doubt(NamedTuple):
-    """Of a host whose RCs alone showed `term`: until it has a leader, or `until`, the host is not believed alone."""
+    """A host whose RCs alone showed `term` is not believed alone until that term has a leader, or `until`."""
 
     term: Term
     until: Ns
@@ -78,13 +78,13 @@ class Terms:
         self._led = NO_TERM
         """The highest term that had a leader."""
         self._tried = deque[Term](maxlen=MAX_TRIED)
-        """The last in which this manager tried to lead."""
+        """The latest terms in which this manager tried to lead."""
         self._shown: dict[HostName, Term] = {}
         """By host: the highest term above `_led` that its RCs showed."""
         self._doubts: dict[HostName, _Doubt] = {}
 
-    def hear(self, word: Word, now: Ns, *, heard: bool) -> Verdict:
-        """Weigh a word. `heard`: a credible leader published within the hold lease."""
+    def weigh(self, word: Word, now: Ns, *, heard: bool) -> Verdict:
+        """Judge a piece of evidence. `heard`: a credible leader published within the hold lease."""
         term = word.term
         if not self.counts(word):
             return IGNORED
@@ -111,11 +111,12 @@ class Terms:
         return not self.secured or word.source in (Source.LEADER, Source.SEAL) or obeys
 
     def is_news(self, term: Term, source: Source) -> bool:
-        """Return True if `hear` could learn something from a refusal for this term."""
+        """Return True if `weigh` could learn from a refusal for this term."""
         return not self.secured or (source is not Source.CLIENT and term > self._led)
 
     def _doubted(self, word: Word, now: Ns) -> Ns:
-        """Note what an RC shows. Until when its host is not believed; 0: it is, for once, or is not alone."""
+        """Note the term that an RC shows. Return the time until which its host is not believed; 0: this time it is
+        believed, or other hosts show the term as well."""
         term, host = word.term, word.host
         if term <= self._led or term in self._tried:
             return 0
@@ -142,7 +143,7 @@ class Terms:
             self._doubts[host] = _Doubt(NO_TERM, min(now, doubt.until), doubt.times - 1)
 
     def tries(self, term: Term) -> None:
-        """This manager asks for promises in `term`: RCs that show it show nobody else's."""
+        """This manager asks for promises in `term`, so RCs that show `term` are no evidence of another candidate."""
         self._tried.append(term)
 
     def led(self, term: Term, now: Ns) -> None:
@@ -163,6 +164,6 @@ class Terms:
         return doubt is not None and doubt.since + silence <= now < doubt.until
 
     def doubted_until(self, host: HostName, now: Ns) -> Ns:
-        """Until when `host` is not believed alone; 0: it is."""
+        """The time until which `host` is not believed alone; 0: it is believed."""
         doubt = self._doubts.get(host)
         return doubt.until if doubt is not None and now < doubt.until else 0

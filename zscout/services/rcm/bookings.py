@@ -14,7 +14,7 @@ from zscout.messages import Ask, BookingRecord, BookingsKept, Operation, Problem
 from zscout.rcm.admission import Admission
 from zscout.rcm.deadlines import Deadlines
 from zscout.rcm.device_check import DeviceCheck
-from zscout.rcm.steps import Again, BookedDanger, ClocksRead, Keep, Outbox, Proposed, Ticket
+from zscout.rcm.steps import BookedDanger, ClocksRead, Keep, Outbox, Proposed, RetryBooking, Ticket
 from zscout.scheduling.booking import BookingConflict, BookingThreatened, Dates
 from zscout.scheduling.core import Core
 from zscout.scheduling.model import ArcRequest, Effect, Event, Propose, Tick, Vote, VoteOverdue
@@ -142,7 +142,7 @@ class Bookings:
             self.dates.out.answers.append((ticket, Problem("bad_name", str(error))))
         return self._out()
 
-    def again(self, again: Again) -> Outbox:
+    def again(self, again: RetryBooking) -> Outbox:
         self.handler.again(again.undecided)
         return self._out()
 
@@ -204,7 +204,7 @@ class Bookings:
                     self._await_another()
                 case (_Due.TRY, _):
                     again, self.handler.undecided = self.handler.undecided, []
-                    self.dates.out.then += map(Again, again)
+                    self.dates.out.then += map(RetryBooking, again)
                     self.dates.out.events += [Tick()] if again else []
                 case (_Due.TELL, _):
                     self._tell()

@@ -207,7 +207,7 @@ class Candidate:
         """A term was shown. A leader steps down below one that it believes."""
         now, before = self.mesh.now(), self.known
         heard = self.rcm is not None or self.election.heard_within(self.fleet.timing.hold_lease, now)
-        verdict = self.terms.hear(word, now, heard=heard)
+        verdict = self.terms.weigh(word, now, heard=heard)
         if verdict.last:
             self._candidacy.last_terms.shown(word.term, before)
         if verdict.why:

@@ -305,7 +305,7 @@ class Rcm:
             log.warning("duplicate device %s at %s; another host's is used", rc, host)
         if self._digest is not None and (out.effects or out.events):
             # All who wait for an answer have it by now.
-            self._digest.take(mesh.now(), out.events, out.effects, self.leader.registry.foretold)
+            self._digest.take(mesh.now(), out.events, out.effects, self.leader.registry.first_estimates)
         self._trace(out.over)
         self._alarm.set(out.wake)
         return True
@@ -366,7 +366,7 @@ class Rcm:
         rc, proposal = proposed
         vote_timeout = self.fleet.timing.vote_timeout / SECOND
         # Overdue once; an answer that comes before the query ends still counts.
-        over = steps.Happened([VoteOverdue(proposal.proposal)])
+        over = steps.CoreEvents([VoteOverdue(proposal.proposal)])
         overdue = self.supervisor.call_later(vote_timeout, self._now_take, over)
         voted = partial(self.supervisor.guard(self._on_ballot), rc, proposal.proposal, overdue)
         late = max(LATE_VOTE, 2 * vote_timeout)
@@ -382,8 +382,8 @@ class Rcm:
         self.mesh.suspicions.suspect(f"{rc} is seen and does not vote", so=reply is None)
         ballot = reply.message if reply is not None else None
         if ballot is not None and ballot.proposal == proposal:
-            self._take(steps.Happened([Vote(proposal, ballot.accept, ballot.reason[:MAX_REASON])]))
+            self._take(steps.CoreEvents([Vote(proposal, ballot.accept, ballot.reason[:MAX_REASON])]))
             return
         if reply is not None and reply.problem is not None:
             log.warning("%s did not vote: %s", rc, reply.problem.message)
-        self._take(steps.Happened([VoteOverdue(proposal)]))
+        self._take(steps.CoreEvents([VoteOverdue(proposal)]))
