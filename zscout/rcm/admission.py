@@ -252,19 +252,19 @@ class Admission:
 
 
 def binding(
-    needs: Mapping[Need, Params], held: Collection[RcName], reported: Mapping[Need, RcName]
+    needs: Mapping[Need, Params], held: Collection[RcName], bound: Mapping[Need, RcName]
 ) -> dict[Need, RcName] | None:
-    """The RC for each pattern if `held` meet `needs` exactly, else None: as `reported` if that is valid."""
+    """The RC for each pattern if `held` meet `needs` exactly, else None: as `bound` if that is valid."""
     patterns = [need for need in needs if is_pattern(need)]
     left = {*held} - needs.keys()
     if len(needs) != len({*held}) or len(left) != len(patterns):
         return None
     if (
-        reported.keys() == {*patterns}
-        and {*reported.values()} == left
-        and all(matcher(need)(rc) for need, rc in reported.items())
+        bound.keys() == {*patterns}
+        and {*bound.values()} == left
+        and all(matcher(need)(rc) for need, rc in bound.items())
     ):
-        return dict(reported)
+        return dict(bound)
     found: dict[RcName, Need] = {}
     for need in patterns:
         if not _meets(need, left, found, set()):

@@ -252,7 +252,7 @@ class Operations:
             raise Refused("old_term", f"{sender} has promised a higher term", ask.term)
 
     def _ask_again(self, ticket: Ticket, ask: Ask, sender: Sender, client: ClientId, arc: ArcId) -> None:
-        """Answer for an open ARC with its state, after the instant has taken in what its client reports, if anything."""
+        """Answer for an open ARC with its state, after the instant if its client reports something new."""
         instant = self.instant
         self._registry.enter(arc, ask.arc, estimate=ask.estimate)
         place, known, shown = self._owned_place(ask, client), self.core.arc(arc), list[model.Event]()

@@ -54,7 +54,7 @@ MAX_WITNESSES: Final = 3
 class _Due(Enum):
     """The purposes of deadlines, whose values are pairs of purpose and subject."""
 
-    TOKEN_DUE = "a client (and its number) has had a lease to show a token"
+    CLIENT_DUE = "a client (and its number) has had a lease to show a token"
     JUDGE = "tokens that disappeared are judged together: the tokens of a lost host disappear one after the other"
     ASK_AGAIN = "a question is asked again"
     PENDING_FOR = "a pending RC has waited so long (ns)"
@@ -132,7 +132,7 @@ class Roster:
         self._doubted_clients: set[ClientId] = set()
         """Clients that disappeared while it was unknown whether this leader was away."""
         self._awaited: dict[ArcId, Ns] = {}
-        """ARCs whose clients believe in holds of RCs never seen here, each with the time when this leader learned it."""
+        """ARCs whose clients believe in holds of RCs never seen here, each with the time when that was learned."""
         self._probed: dict[str, int] = {}
         """By key: the probes left."""
         self._lost_tokens: list[tuple[ClientId | RcName, Token]] = []
@@ -298,7 +298,7 @@ class Roster:
         self._now = now
         while (due := self._deadlines.pop_due(now)) is not None:
             match due:
-                case _Due.TOKEN_DUE, (client, at) if self._token_due.get(client) == at:
+                case _Due.CLIENT_DUE, (client, at) if self._token_due.get(client) == at:
                     self._client_overdue(client, at)
                 case _Due.JUDGE, _:
                     self._judge_lost_tokens()
@@ -376,7 +376,7 @@ class Roster:
         at = now + self.sight.lease
         if self._token_due.get(client) != at:
             self._token_due[client] = at
-            self._deadlines.set(at, (_Due.TOKEN_DUE, (client, at)))
+            self._deadlines.set(at, (_Due.CLIENT_DUE, (client, at)))
 
     def _client_overdue(self, client: ClientId, number: Ns) -> None:
         if self._stalled_recently:

@@ -121,6 +121,6 @@ def test_what_is_no_name_or_too_old_is_not_remembered() -> None:
 
 def test_who_follows_no_tokens_any_more_knows_of_nobody_that_it_lives() -> None:
     devices = ExpectedDevices({})
-    devices.came(token("ws1"))
-    devices.lost_sight(10 * SECOND)
+    devices.token_came(token("ws1"))
+    devices.forget_tokens(10 * SECOND)
     assert (shown(devices, 12 * SECOND).gone, shown(devices, 12 * SECOND).reason) == (2.0, "the node of ws1 is gone")

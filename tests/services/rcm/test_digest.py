@@ -79,9 +79,9 @@ class Term2:
         joined = [RcJoined(rc, sharable=False) for rc in ("robot/a", "robot/b")]
         self.at(10, *joined, LeadTaken(Term(2, "new"), holds, waiting))
 
-    def at(self, second: float, *events: Event, first_estimates: Mapping[str, int] = MappingProxyType({})) -> None:
+    def at(self, second: float, *events: Event, estimates: Mapping[str, int] = MappingProxyType({})) -> None:
         now = round(second * SECOND)
-        self.digest.take(now, events, self.core.handle(now, *events), first_estimates)
+        self.digest.take(now, events, self.core.handle(now, *events), estimates)
 
 
 def test_a_wait_is_from_the_queue_to_the_grant_and_begins_anew_when_it_is_preempted() -> None:
@@ -138,7 +138,7 @@ def test_the_first_estimate_is_compared_with_the_start() -> None:
     fleet = Term2()
     fleet.at(20, Requested(asked("one", "robot/a")))
     fleet.at(21, Requested(asked("two", "robot/a")))
-    fleet.at(30, Released("h/c/one"), first_estimates={"h/c/two": 80 * SECOND})
+    fleet.at(30, Released("h/c/one"), estimates={"h/c/two": 80 * SECOND})
     assert [one.late for one in fleet.heard.began] == [None, -50 * SECOND]
 
 

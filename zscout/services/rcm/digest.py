@@ -74,11 +74,11 @@ class HoldDigest:
         now: Ns,
         events: Iterable[Event],
         effects: Iterable[Effect],
-        first_estimates: Mapping[ArcId, Ns] = MappingProxyType({}),
+        estimates: Mapping[ArcId, Ns] = MappingProxyType({}),
     ) -> None:
         """What happened in one instant, in its order. `foretold`: the starts that clients were notified of first."""
         try:
-            self._take(now, events, effects, first_estimates)
+            self._take(now, events, effects, estimates)
         except Exception:
             log.exception("holds are neither counted nor told of any more in this term")
             self._listeners = ()
@@ -93,9 +93,7 @@ class HoldDigest:
         except Exception:
             log.exception("holds that go on were not counted")
 
-    def _take(
-        self, now: Ns, events: Iterable[Event], effects: Iterable[Effect], first_estimates: Mapping[ArcId, Ns]
-    ) -> None:
+    def _take(self, now: Ns, events: Iterable[Event], effects: Iterable[Effect], estimates: Mapping[ArcId, Ns]) -> None:
         recovered: list[ArcId] = []
         for event in events:
             match event:
@@ -113,7 +111,7 @@ class HoldDigest:
         for effect in effects:
             match effect:
                 case Granted(arc=arc, waited=waited):
-                    start = first_estimates.get(arc)
+                    start = estimates.get(arc)
                     self._begin(arc, now, waited, None if start is None or waited is None else now - start)
                 case HoldEnded(arc=arc, outcome=outcome, reason=reason, requeued=requeued):
                     if (began := self._held.pop(arc, None)) is not None:
