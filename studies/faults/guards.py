@@ -297,7 +297,7 @@ GUARDS: Final[Mapping[str, Guard]] = MappingProxyType(
         ),
         "majority": Guard("a candidate that RCs contradict waits", {(Election, "must_wait"): _no}),
         "deposed": Guard("who was deposed waits longer each time", {(Election, "deposed"): _nothing}),
-        "step down": Guard("a leader that sees a higher term steps down", {(Candidate, "_see"): _believe}),
+        "step down": Guard("a leader that sees a higher term steps down", {(Candidate, "_weigh"): _believe}),
         "away": Guard("a leader that was away itself drops nobody for it", {(Roster, "_was_away"): _no}),
         "reopen": Guard("who was dropped and lives goes on at its place", {(RequestLog, "reopens"): _no}),
         "places": Guard("a client shows the place that it had", {(OpenArc, "_as_asked"): _without_place}),

@@ -158,7 +158,7 @@ class Leader:
             case steps.BookingAsked(asked):
                 return merge(self._bookings.operation(*asked))
             case steps.RetryBooking():
-                return merge(self._bookings.again(work))
+                return merge(self._bookings.retry(work))
             case steps.Kept(keep, why):
                 return merge(self._bookings.kept(keep, why))
             case steps.Shared():

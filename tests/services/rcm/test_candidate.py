@@ -115,20 +115,20 @@ async def test_while_most_rcs_see_a_leader_nobody_takes_over() -> None:
     await until(lambda: candidate.rcm)
 
 
-@pytest.mark.parametrize("stood_still", [False, True])
-async def test_a_candidate_that_has_stood_still_does_not_lead_alone_at_once(
-    stood_still: bool, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("stalled", [False, True])
+async def test_a_candidate_that_has_stalled_does_not_lead_alone_at_once(
+    stalled: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It may be it that the others have lost."""
     fleet = FakeFleet("x", "y")
     leader, heir = fleet.candidate("x"), fleet.candidate("y")
     await until(lambda: leader.rcm)
     await asyncio.sleep(5)
-    monkeypatch.setattr(heir._candidacy.stall, "fresh", lambda: stood_still)
+    monkeypatch.setattr(heir._candidacy.stall, "fresh", lambda: stalled)
     before = heir.mesh.now()
     fleet.network.kill(leader.mesh)
     await until(lambda: heir.rcm)
-    assert (heir.mesh.now() - before >= heir.election.silence) == stood_still
+    assert (heir.mesh.now() - before >= heir.election.silence) == stalled
 
 
 async def test_a_leader_steps_down_for_a_higher_term_and_asks_nothing_more() -> None:

@@ -177,7 +177,7 @@ def test_a_listener_that_fails_ends_the_telling_and_nothing_else(caplog: pytest.
     for second, event in enumerate([*events, Requested(asked("one", "robot/a")), Released("h/c/one")]):
         digest.take(second * SECOND, [event], core.handle(second * SECOND, event))
     assert heard.over == []
-    assert [one.message for one in caplog.records] == ["holds are neither counted nor told of any more in this term"]
+    assert [one.message for one in caplog.records] == ["figures and notices of holds failed: disabled for this term"]
 
 
 async def test_an_rcm_tells_its_listeners_once_all_others_have_their_answers() -> None:

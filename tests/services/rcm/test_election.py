@@ -182,10 +182,10 @@ def test_who_was_deposed_and_sees_nobody_else_waits_as_well() -> None:
     assert not seen.must_wait({}, False, LATER + SILENCE)
 
 
-def test_who_has_stood_still_waits_where_nobody_tells_of_a_leader() -> None:
+def test_who_has_stalled_waits_where_nobody_tells_of_a_leader() -> None:
     """It lost the leader's token first: the others' follow."""
     seen = election()
-    seen.stood_still(LATER)
+    seen.stalled(LATER)
     assert not seen.must_wait(hosts(False), False, LATER)
     assert seen.must_wait({}, False, LATER)
     assert not seen.must_wait({}, False, LATER + SILENCE)
@@ -231,7 +231,7 @@ def test_who_waited_alone_once_does_so_anew_after_a_leader_was_seen() -> None:
     seen.candidate("c", alive=False, now=LATER)
     assert seen.must_wait({}, False, LATER)
     seen.leader("i", "a", alive=True, now=LATER + SECOND)
-    seen.stood_still(LATER + 3 * SILENCE)
+    seen.stalled(LATER + 3 * SILENCE)
     assert seen.must_wait({}, False, LATER + 3 * SILENCE)
 
 
@@ -239,7 +239,7 @@ def test_who_waited_alone_once_does_so_anew_after_a_leader_was_seen() -> None:
     ("happens", "returning"),
     [
         pytest.param([], False, id="nothing"),
-        pytest.param([lambda seen: seen.stood_still(LATER)], True, id="it stood still"),
+        pytest.param([lambda seen: seen.stalled(LATER)], True, id="it stood still"),
         pytest.param([lambda seen: seen.candidate("c", alive=False, now=LATER)], True, id="it lost another host"),
         pytest.param([lambda seen: seen.candidate("a", alive=False, now=LATER)], False, id="the leader's host went"),
         pytest.param(

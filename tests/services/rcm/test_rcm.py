@@ -264,7 +264,7 @@ async def test_a_hold_that_is_adopted_and_displaced_in_one_instant_is_told_as_it
     before, at = Term(4, "before"), rcm.mesh.now()
     kept = ArcRequest(f"{one.name}/id", one.name, {"robot/a": {}}, 0, SECOND, keep=True, label="tally")
     held = RecoveredHold(kept, Place(before, 1), Grant(before, 3), at - 5 * SECOND, at - 4 * SECOND)
-    rcm._now_take(CoreEvents([RcJoined("robot/a", sharable=False), Adopted(held)]))
+    rcm._take_now(CoreEvents([RcJoined("robot/a", sharable=False), Adopted(held)]))
     await until(lambda: one.notices)
     assert [(it.state, it.outcome, it.grant) for it in one.notices] == [("ended", "completed", Grant(before, 3))]
 

@@ -1,5 +1,5 @@
-"""The dates of bookings for the core of a leader, ranked: of two that can't both be kept that of higher priority
-stands, then what was made earlier. The core judges them; records and views say what it found."""
+"""The ranked dates of all bookings, for the core of a leader. Of two dates that conflict the core keeps the date of
+higher priority, else of the older booking. Its decisions are reported in views, and stored in records where needed."""
 
 from __future__ import annotations
 
@@ -44,11 +44,11 @@ from zscout.services.bookings.records import Records
 from zscout.types import SECOND, Grant, Need, Ns, RcName
 
 MAX_CLAIMS = 4_000
-"""Dates of all bookings that a leader keeps free: of what is repeated those of the next 60 days."""
+"""Dates of all bookings in the core at most; repeated bookings have their dates of the next 60 days there."""
 PART = 100
-"""Dates that a core takes in at a time: some 5 ms."""
+"""Dates in one event for the core, which takes it some 5 ms."""
 MAX_DIGITS = 11
-"""Of an instant."""
+"""Digits of an instant at most."""
 SKIPPED = "the fleet's clock was put forward past it"
 
 
@@ -60,7 +60,7 @@ class Date(NamedTuple):
 
     @property
     def id(self) -> str:
-        """The core's name of it."""
+        """The core's name of this date."""
         return f"{self.record.id}@{self.start}"
 
     @property
@@ -69,54 +69,57 @@ class Date(NamedTuple):
 
 
 class _Expanded(NamedTuple):
-    """A record with its dates, and the core's bookings for them, until another one begins to be kept or is over."""
+    """A record and the core's bookings for its dates."""
 
     record: BookingRecord
     rank: tuple[int, Grant, str]
     ahead: Ns
+    """Fleet time less the host's clock, for the start of each date."""
     until: float
+    """The fleet time until which `bookings` are complete and current."""
     next: float
+    """The first date beyond the window, if the booking is repeated; else infinite."""
     bookings: list[Booking]
 
 
 class BookedDates:
-    """`now`, on the host's clock, is set by the caller."""
+    """The dates of a leader. The caller sets `now`, by the host's clock."""
 
     def __init__(self, core: Core, records: Records, clock: FleetClock) -> None:
         self._core, self._records, self.clock = core, records, clock
         self.now: Ns = 0
         self.out = Outbox()
-        """Until the caller takes it."""
+        """Results of the present step, until the caller takes them."""
         self._conflicts: dict[str, str] = {}
-        """Dates that are not kept, with the one that stands; nothing where no RC of a pattern is free."""
+        """Dates that are not kept, each with the date that takes precedence; empty: no RC matches a pattern."""
         self._repetitions: dict[str, tuple[tuple[object, ...], Repetition]] = {}
         self._expanded: dict[str, _Expanded] = {}
         self._sent: frozenset[str] = frozenset()
-        """Dates that the core knows of."""
+        """Dates in the core."""
         self._danger: dict[str, str] = {}
-        """Why dates may not be kept, in words."""
+        """By date: the reason that it may not be kept, as text for people."""
         self._dated_by: Ns = clock.at(0)
-        """By how much fleet time is ahead of the host's clock for all dates in the core, so that what follows upon
-        another does so there as well."""
+        """Fleet time less the host's clock, the same for all dates in the core, so that adjacent dates stay adjacent
+        there."""
         self._moved: Ns = 0
-        """The step of the dates in the core that `reconcile` has not sent yet."""
+        """The shift of the dates in the core that `reconcile` has not sent yet."""
 
     @property
     def time(self) -> float:
-        """Fleet time, in seconds since 1970 (UTC), as the core goes by it."""
+        """The core's fleet time, in seconds since 1970 (UTC)."""
         return self.to_fleet(self.now) / SECOND
 
     def local(self, instant: Instant) -> Ns:
-        """When that is, on the core's clock."""
+        """The time of an instant on the core's clock."""
         return instant * SECOND - self._dated_by
 
     def to_fleet(self, time: Ns) -> Ns:
-        """The same the other way: ns since 1970 (UTC)."""
+        """The fleet time, in ns since 1970 (UTC), of a time on the core's clock."""
         return time + self._dated_by
 
     def claim(self, date: Date, *, taken: bool = False) -> Booking:
-        """As the core takes it; one that is `taken` has no patience to lapse by. Raises ValueError for a record that
-        is none."""
+        """The core's booking for a date; if it is `taken`, it does not lapse before its end. Raises ValueError for a
+        malformed record."""
         record = date.record
         for need in record.needs:
             (check_maintained if record.maintenance else check_need)(need)
@@ -140,12 +143,13 @@ class BookedDates:
         )
 
     def dated(self, request: ArcRequest) -> ArcRequest:
-        """With the date that it waits for where what it takes up is not in the core."""
+        """The request with the start of the date that it takes up, which the core may not know."""
         start = start_of(request.booking)
         return request if start is None else replace(request, not_before=self.local(start))
 
     def open_dates(self, record: BookingRecord, taken: Collection[str] = ()) -> list[Date]:
-        """Those of a booking that are not over; of what is repeated within the next 60 days."""
+        """The dates of a booking that are not over; of a repeated booking, those within the next 60 days. `taken` dates
+        do not lapse."""
         if record.unbooked:
             return []
         if not 0 < record.runtime <= MAX_AHEAD or (starts := self._starts(record)) is None:
@@ -155,7 +159,7 @@ class BookedDates:
         return [date for date in left if date.id in taken or not self._lapsed(date)]
 
     def _starts(self, record: BookingRecord) -> list[Instant] | None:
-        """The dates of a booking that are not past; None: it is malformed, and is not kept."""
+        """The dates of a booking that are not past; None: the record is malformed, which is logged."""
         time = self.time
         try:
             return self._repetition(record).between(time - float(record.runtime), time + _ahead(record))
@@ -170,8 +174,8 @@ class BookedDates:
             known = self._repetitions[record.id] = rule, Repetition(record)
         return known[1]
 
-    def until_another(self) -> float:
-        """Seconds until what is repeated has one more date within 60 days; infinite where nothing is."""
+    def until_next_date(self) -> float:
+        """Seconds until a repeated booking has one more date within 60 days; infinite if none is repeated."""
         return min((known.next for known in self._expanded.values()), default=math.inf) - WINDOW - self.time
 
     def _lasting(self) -> list[BookingRecord]:
@@ -181,21 +185,22 @@ class BookedDates:
         ]
 
     def until_renewal(self) -> float:
-        """Seconds until maintenance without an end is to be put off; infinite where there is none."""
+        """Seconds until maintenance without an end must be renewed; infinite if there is none."""
         return min(map(_end, self._lasting()), default=math.inf) - WINDOW / 2 - self.time
 
     def renew(self) -> None:
-        """Have maintenance without an end begin again for 60 days, where half of that is over."""
+        """Extend maintenance without an end to 60 days from now, where less than half of that is left."""
         for record in self._lasting():
             if _end(record) - self.time <= WINDOW / 2:
-                self._begin_again(record)
+                self._restart(record)
 
-    def _begin_again(self, record: BookingRecord) -> None:
-        """Have maintenance without an end begin now, for 60 days."""
+    def _restart(self, record: BookingRecord) -> None:
+        """Let maintenance without an end begin now, for 60 days."""
         self.change(record, start=int(self.time), runtime=Decimal(WINDOW), patience=Decimal(WINDOW))
 
     def _lapsed(self, date: Date) -> bool:
-        """Whether nobody took it up in time: that follows from the time alone, and is not kept."""
+        """Return True if no request took up this date in time. That follows from the time alone, so it is not
+        stored."""
         waits = date.record.runtime if date.record.maintenance else min(date.record.patience, date.record.runtime)
         if self.local(date.start) + round(waits * SECOND) > self.now:
             return False
@@ -205,14 +210,14 @@ class BookedDates:
     # The core's claims
 
     def recovered(self, taken: Collection[str]) -> Dates:
-        """The event by which a core that begins to lead knows of all dates; `taken`: those that ARCs have taken up."""
+        """The event with all dates for the core of a new leader; `taken`: dates that ARCs have taken up."""
         found = Dates(tuple(self._ranked(taken)))
         self._sent = frozenset(booking.id for booking in found.ranked)
         return found
 
     def parts(self) -> Iterator[Dates]:
-        """The same in parts of bounded size, to be sent before it; those that may be taken up after they lapsed are
-        not among them."""
+        """The dates of `recovered` in events of bounded size, to be sent before it; without lapsed dates that may turn
+        out to be taken up."""
         part = list[Booking]()
         for record in list(self._records):
             known = self._expanded[record.id] = self._expand(record, ())
@@ -247,15 +252,17 @@ class BookedDates:
         bookings, dates = list[Booking](), self.open_dates(record, taken)
         try:
             if dates:
-                of_all = self.claim(dates[0])
+                first_claim = self.claim(dates[0])
                 bookings = [
-                    of_all,
+                    first_claim,
                     *(
-                        replace(of_all, id=date.id, start=self.local(date.start), bound=date.bound)
+                        replace(first_claim, id=date.id, start=self.local(date.start), bound=date.bound)
                         for date in dates[1:]
                     ),
                 ]
-                bookings = [replace(one, patience=one.runtime) if one.id in taken else one for one in bookings]
+                bookings = [
+                    replace(claim, patience=claim.runtime) if claim.id in taken else claim for claim in bookings
+                ]
         except ValueError as error:
             self.out.strange.append((record.id, f"booking {record.id} is not kept: {error}"))
         coming, ahead = math.inf, _ahead(record)
@@ -268,10 +275,10 @@ class BookedDates:
         return _Expanded(record, rank, self._dated_by, until, coming if record.every else math.inf, bookings)
 
     def reconcile(self) -> Dates:
-        """The event that brings the core's claims to what the records say."""
+        """The event that replaces the core's claims by the dates of the records."""
         ranked = tuple(self._ranked())
         before, self._sent = self._sent, frozenset(booking.id for booking in ranked)
-        # What is only forgotten here, as it could be kept nowhere, another host may have.
+        # A date without a record may return: no keeper stored the record, but another host may have it.
         gone = before - self._sent
         event = Dates(ranked, frozenset(name for name in gone if self.date(name) is None), moved=self._moved)
         self._moved = 0
@@ -283,11 +290,11 @@ class BookedDates:
         return event
 
     def redate(self, *, settled: bool) -> bool:
-        """Follow a step of fleet time; return True if there was one, and all dates are to be reconciled.
+        """Follow a step of fleet time. Return True if there was one, so that all dates must be reconciled.
 
-        By a time that is `settled`: a hold that began for a date which is not now continues as an ordinary one, and the
-        date is over, so that it never begins again; so does a request whose date was skipped. Dates that were skipped
-        are reported. Maintenance without an end lasts."""
+        If fleet time is `settled`, skipped dates are reported, and maintenance without an end restarts now. A taken
+        date is over if its end is now past, or if its ARC holds RCs and its start is now in the future: the ARC
+        continues without a booking, so that no date begins twice."""
         now, ahead = self.now, self.clock.at(self.now) - self.now
         if ahead == self._dated_by:
             return False
@@ -313,20 +320,20 @@ class BookedDates:
         return True
 
     def _end_dates(self, over: Mapping[str, Collection[Instant]]) -> None:
-        """Keep that these dates of bookings are over."""
+        """Store that these dates of bookings are over."""
         for booking, starts in over.items():
             if (record := self._records.get(booking)) is not None:
                 self.change(record, over=sorted({*record.over, *starts}))
 
     def number(self) -> Grant:
-        """(term, seq) of what is made or changed now: above all that is known. Where all hosts were started anew terms
-        began anew."""
+        """The (term, seq) of a change made now: above that of all known records, even if terms restarted with the
+        fleet."""
         own = Grant(self._core.term, self._core.number())
         latest = self._records.latest
         return own if own > latest else Grant(latest.term, latest.seq + 1)
 
     def change(self, record: BookingRecord, **to: object) -> BookingRecord:
-        """The record, changed in this term."""
+        """Change a record, store it, and have it shared. Return the stored record."""
         changed = self.number()
         new = replace(record, changed=changed, **to)
         self._records.take([new])
@@ -334,8 +341,8 @@ class BookedDates:
         return self._records.get(record.id) or new
 
     def note(self, effects: Iterable[Effect], *, settled: bool) -> bool:
-        """What became of dates in an instant; whether `reconcile` is to be called, in another one. What was used by a
-        time that is not `settled` may still be to come."""
+        """Take over the effects of an instant on dates. Return True if `reconcile` must be called in another instant.
+        Unless fleet time is `settled`, used dates are not stored as over: they may still be in the future."""
         over: dict[str, list[Instant]] = {}
         lapsed = False
         for effect in effects:
@@ -344,16 +351,16 @@ class BookedDates:
                     booking, _, start = name.partition("@")
                     over.setdefault(booking, []).append(int(start))
                 case BookingChanged(state=BookingState.LAPSED | BookingState.USED):
-                    # That follows from the time alone, and so is not kept.
+                    # This follows from the time alone, so it is not stored.
                     lapsed = True
                 case BookingThreatened(booking=name, reason=None):
                     self._danger.pop(name, None)
                 case BookingThreatened(name, Reason() as reason) if (date := self.date(name)) is not None:
-                    self._danger[name] = reason.text(partial(self._told, date.record.zone))
+                    self._danger[name] = reason.text(partial(self._text, date.record.zone))
                 case BookingConflict(booking=name, by=None):
                     self._conflicts.pop(name, None)
                 case BookingConflict(booking=name, by=str() as by):
-                    # The core does not tell of it any more, and begins anew where it stands again.
+                    # The core no longer reports this date's danger; once the conflict ends, it reports it again.
                     self._danger.pop(name, None)
                     self._conflicts[name] = by
                 case BookingBound(booking=name, bound=bound) if (date := self.date(name)) is not None:
@@ -361,15 +368,15 @@ class BookedDates:
         self._end_dates(over)
         return bool(over) or lapsed
 
-    def _told(self, zone: str, time: Ns) -> str:
+    def _text(self, zone: str, time: Ns) -> str:
         return told(self.to_fleet(time) / SECOND, zone)
 
     def dangers(self) -> dict[str, str]:
-        """By date, as the core calls it: what may keep it from its start, in words."""
+        """By the core's name of a date: the reason that it may not begin, as text for people."""
         return self._danger | {name: self._conflict(by) for name, by in self._conflicts.items()}
 
     def date(self, name: str) -> Date | None:
-        """What the core calls so; None: its booking is forgotten."""
+        """The date of this name in the core; None: there is no record of its booking."""
         booking, _, start = name.partition("@")
         record = self._records.get(booking)
         return None if record is None else Date(record, int(start))
@@ -382,12 +389,12 @@ class BookedDates:
 
     # For people and programs
 
-    def standing(self, record: BookingRecord) -> list[Date]:
+    def dates_in_core(self, record: BookingRecord) -> list[Date]:
         """The dates of a booking that are in the core."""
         return [date for date in self.open_dates(record) if self._core.booking(date.id) is not None]
 
     def view(self, record: BookingRecord) -> BookingView:
-        told, runtime, maintained = [], round(record.runtime), list[RcName]()
+        views, runtime, maintained = [], round(record.runtime), list[RcName]()
         for date in self.open_dates(record):
             kept, by = self._core.booking(date.id), self._conflicts.get(date.id)
             taken = kept.arc if kept is not None else None
@@ -396,23 +403,23 @@ class BookedDates:
             if by is None and kept is not None and kept.is_unbound and not danger:
                 danger = "a shared device has not yet answered whether it can carry it"
             bound = dict(kept.bound) if kept is not None else date.bound
-            told.append(BookedDate(date.start, date.start + runtime, state, bound, taken, danger))
+            views.append(BookedDate(date.start, date.start + runtime, state, bound, taken, danger))
             if kept is not None and record.needs.keys() != {*kept.maintained}:
                 maintained = sorted(kept.maintained)
         fields = {name: getattr(record, name) for name in BookingView.__struct_fields__ if hasattr(record, name)}
-        return BookingView(**fields, dates=told, maintained=maintained)
+        return BookingView(**fields, dates=views, maintained=maintained)
 
 
 def start_of(name: str) -> Instant | None:
-    """When the date begins that the core calls so, as others may tell of it; None: it is none."""
+    """The start in a date's name, which may come from another host; None: it has no valid start."""
     _, _, start = name.partition("@")
     return int(start) if start.isascii() and start.isdecimal() and len(start) <= MAX_DIGITS else None
 
 
 def _end(record: BookingRecord) -> float:
-    """The end of what is not repeated."""
+    """The end of a booking that is not repeated."""
     return record.start + float(record.runtime)
 
 
 def _ahead(record: BookingRecord) -> float:
-    return WINDOW if record.every else MAX_AHEAD + DAY  # the clock that it was booked by may have been ahead
+    return WINDOW if record.every else MAX_AHEAD + DAY  # the clock may have been ahead when it was booked

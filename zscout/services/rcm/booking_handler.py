@@ -1,4 +1,4 @@
-"""Operations on bookings: what people and programs book, give up, and look for; and who takes a booking up."""
+"""Operations on bookings: book, cancel, find free slots; and requests that use a booking."""
 
 from __future__ import annotations
 
@@ -44,25 +44,25 @@ from zscout.services.rcm.booked_dates import MAX_CLAIMS, BookedDates, Date, star
 from zscout.types import SECOND, Need, Ns
 
 MAX_UNDECIDED: Final = 64
-"""Operations that wait for votes, or for a keeper, at one time."""
+"""Operations that wait for votes at one time; and operations that wait for a keeper."""
 DECIDE_WITHIN: Final[Ns] = 3 * SECOND // 2
-"""An RC that does not vote is asked again meanwhile."""
+"""The time that an operation waits for votes: enough to ask a silent RC again."""
 NAMED: Final = 3
-"""Of what is in the way, so many are named."""
+"""Conflicting bookings that a refusal names."""
 
 
 @dataclass(slots=True, eq=False)
 class _Undecided:
-    """An operation whose votes are not all known yet."""
+    """An operation that waits for votes."""
 
     ticket: Ticket
     decide: Callable[[], bool]
-    """Tries; whether it is decided."""
+    """Try to decide it, and return True if that succeeds."""
     until: Ns = 0
 
 
 class BookingHandler:
-    """What follows from operations is in `out` of the dates, until the caller takes that."""
+    """Adds the results of operations to `out` of the dates, until the caller takes them."""
 
     def __init__(
         self,
@@ -77,12 +77,12 @@ class BookingHandler:
         self._fleet, self._core, self._records, self._dates = fleet, core, records, dates_
         self._admission, self._device_check = admission, device_check
         self._runtimes = runtimes
-        """What is known of how long holds last, for hints."""
+        """For hints on when a slot is likely to be free."""
         self.undecided: list[_Undecided] = []
         self._keeping = 0
 
     def operation(self, ticket: Ticket, sender: Sender, operation: Operation) -> None:
-        """Takes one in; the core is at the present time. Raises Refused."""
+        """Carry out an operation; the core must be at the present time. Raises Refused."""
         check_name(operation.id, "id")
         match operation:
             case Book():
@@ -104,13 +104,13 @@ class BookingHandler:
         self._try(_Undecided(ticket, lambda: self._is_made(ticket, record.id, sender) or self._decide(ticket, record)))
 
     def _is_held(self, needs: Collection[Need], sender: Sender) -> bool:
-        """Return True if requests of `sender`, or of another of its name, hold all these devices now."""
+        """Return True if requests of `sender`, or of clients with the same name, hold all these devices now."""
         arcs = map(self._core.arc, {*self._core.arcs_of(str(sender)), *self._core.arcs_of_owners([sender.host])})
         held = {rc for arc in arcs if arc is not None and arc.hold is not None for rc in arc.needs}
         return held >= {*needs}
 
     def _is_made(self, ticket: Ticket, booking: str, sender: Sender) -> bool:
-        """Answers what is asked for again. Raises Refused."""
+        """Answer a repeated operation. Return False if there is no such booking yet. Raises Refused."""
         if (known := self._records.get(booking)) is None:
             return False
         self._admission.check_owner(sender, known, "ask for it")
@@ -118,7 +118,7 @@ class BookingHandler:
         return True
 
     def _record(self, wanted: Book, sender: Sender) -> BookingRecord:
-        """Raises Refused for what is no booking."""
+        """The new record. Raises Refused for an invalid booking."""
         time = self._dates.time
         try:
             check_name(wanted.name, "name of the booking")
@@ -160,8 +160,8 @@ class BookingHandler:
     def _check_room(self, record: BookingRecord) -> None:
         records, owner = self._records, record.owner
         most = self._admission.limits.max_bookings_per_host
-        own = [one for one in records if one.owner == owner]
-        if sum(not one.unbooked for one in own) >= most:
+        own = [other for other in records if other.owner == owner]
+        if sum(not other.unbooked for other in own) >= most:
             raise Refused("too_many", f"{owner} has {most} bookings, the most allowed; cancel one")
         if self._admission.closed:
             self._check_share(record, own)
@@ -171,9 +171,10 @@ class BookingHandler:
             raise Refused("too_many", f"{MAX_CLAIMS} dates are booked, the most allowed; repeat it less often")
 
     def _check_share(self, record: BookingRecord, own: list[BookingRecord]) -> None:
-        """One name has half of the fleet's room at most: what was given up takes some until its last date is over."""
+        """Raises Refused if the owner would have more than half of the fleet's bookings, or dates. A cancelled booking
+        counts until its last date is over."""
         if len(own) >= MAX_BOOKINGS // 2:
-            words = f"{record.owner} has {len(own)} bookings, also those cancelled, half of what is kept"
+            words = f"{record.owner} has {len(own)} bookings, cancelled ones included, the most allowed"
             raise Refused("too_many", f"{words}; ask again when some are over")
         dates = sum(booking.owner == record.owner for booking, _ in self._core.bookings())
         if dates + len(self._dates.open_dates(record)) > MAX_CLAIMS // 2:
@@ -181,11 +182,11 @@ class BookingHandler:
             raise Refused("too_many", f"{record.owner} has {dates} dates booked, {most} at most; repeat it less often")
 
     def _decide(self, ticket: Ticket, record: BookingRecord) -> bool:
-        """Whether it is decided: all its dates that are kept free from now on are free, or one is not. Raises Refused
-        where there is no room any more."""
+        """Make the booking if all its dates in the window are free, refuse it if one is not; return False while votes
+        are missing. Raises Refused if there is no room for it."""
         self._check_room(record)
         unknown, bound = [], dict[int, dict[str, str]]()
-        # Maintenance goes before what is booked: who is in its way is told.
+        # Maintenance takes precedence over bookings: the owners of conflicting bookings are notified.
         for date in [] if record.maintenance else self._dates.open_dates(record):
             claim = self._dates.claim(date)
             found = self._core.slots(claim, claim.start, 1)
@@ -208,37 +209,39 @@ class BookingHandler:
         return True
 
     def _in_the_way(self, date: Date, claim: Booking) -> str:
-        """Why a date can't be booked, in words."""
+        """The reason that a date can't be booked, as text for people."""
         others = [
-            one
-            for one, _ in self._core.bookings()
-            if one.start < claim.end and claim.start < one.end and self._share(one, claim)
+            booking
+            for booking, _ in self._core.bookings()
+            if booking.start < claim.end and claim.start < booking.end and self._share(booking, claim)
         ]
-        names = [f"{one.label or one.id} of {one.owner} ({', '.join(one.needs)})" for one in others[:NAMED]]
+        names = [f"{other.label or other.id} of {other.owner} ({', '.join(other.needs)})" for other in others[:NAMED]]
         more = f" and {len(others) - NAMED} more" if len(others) > NAMED else ""
-        why = f"booked then: {'; '.join(names)}{more}" if names else "held, in maintenance or promised to who waits"
+        why = (
+            f"booked then: {'; '.join(names)}{more}" if names else "held, in maintenance or promised to queued requests"
+        )
         return f"not all of {', '.join(date.record.needs)} are free at {told(date.start, date.record.zone)}: {why}"
 
-    def _share(self, one: Booking, other: Booking) -> bool:
-        """Return True if `other` needs an RC that `one` has."""
-        status = self._core.booking(one.id)
-        names = {*one.needs, *one.bound.values(), *(() if status is None else status.maintained)}
+    def _share(self, booking: Booking, other: Booking) -> bool:
+        """Return True if `other` needs an RC that `booking` has."""
+        status = self._core.booking(booking.id)
+        names = {*booking.needs, *booking.bound.values(), *(() if status is None else status.maintained)}
         return any(rc in names or (is_pattern(rc) and any(map(matcher(rc), names))) for rc in other.needs)
 
     def _answer_kept(self, ticket: Ticket, record: BookingRecord, *, withdraw: bool = False) -> None:
-        """Answers once it is kept; `withdraw`: forgets it where it can't be."""
+        """Have the record stored, then answer; `withdraw`: remove it if storing fails."""
         if self._keeping >= MAX_UNDECIDED:
             raise Refused("busy", f"{MAX_UNDECIDED} bookings are already being stored; try again")
         self._keeping += 1
         self._dates.out.keep.append(Keep(ticket, record.id, withdraw))
 
     def kept(self, keep: Keep, why: str) -> None:
-        """A record is kept, or not: `why`."""
+        """A record is stored; or not, for the reason `why`."""
         self._keeping -= 1
         record = self._records.get(keep.booking)
         if record is None or why:
             if record is not None and keep.withdraw:
-                # Not given up, which is final: another leader may have made it as well, or may have heard of it.
+                # Not cancelled, which is final: another leader may have made it as well, or may have received it.
                 self._records.remove(keep.booking)
                 self._dates.out.events.append(self._dates.reconcile())
             refused = Refused("not_kept", f"no other host stored this booking: {why or 'it is over'}")
@@ -246,7 +249,7 @@ class BookingHandler:
         else:
             self._dates.out.answers.append((keep.ticket, self._dates.view(record)))
 
-    # Giving up
+    # Cancelling
 
     def _unbook(self, ticket: Ticket, operation: Unbook, sender: Sender) -> None:
         record = self._records.get(operation.id)
@@ -265,7 +268,7 @@ class BookingHandler:
         self._dates.out.events.append(self._dates.reconcile())
         self._answer_kept(ticket, new)
 
-    # Looking for a time
+    # Finding free slots
 
     def _find_slots(self, ticket: Ticket, asked: FindSlots, sender: Sender) -> None:
         self._admission.check_booking(asked, sender)
@@ -287,9 +290,9 @@ class BookingHandler:
             self._dates.out.proposals += map(self.proposal, self._core.ask_votes(found.unknown, wanted))
             return False
         slots = []
-        for one in found.found:
-            start, latest = -(-self._dates.to_fleet(one.start) // SECOND), self._dates.to_fleet(one.latest) // SECOND
-            slots.append(SlotView(start, max(start, latest), dict(one.bound)))
+        for slot in found.found:
+            start, latest = -(-self._dates.to_fleet(slot.start) // SECOND), self._dates.to_fleet(slot.latest) // SECOND
+            slots.append(SlotView(start, max(start, latest), dict(slot.bound)))
         guess = None if self._runtimes is None else self._core.likely_slot(wanted, until, self._runtimes)
         likely = None if guess is None else -(-self._dates.to_fleet(guess) // SECOND)
         if likely is not None and slots and likely >= slots[0].start:
@@ -306,8 +309,8 @@ class BookingHandler:
             undecided.until = self._now + DECIDE_WITHIN
             self.undecided.append(undecided)
 
-    def again(self, undecided: _Undecided) -> None:
-        """Votes have come, or are overdue."""
+    def retry(self, undecided: _Undecided) -> None:
+        """Decide an operation after votes arrived; refuse it if they are overdue."""
         try:
             if undecided.decide():
                 return
@@ -322,7 +325,7 @@ class BookingHandler:
             self.undecided.append(undecided)
 
     def proposal(self, asked: Propose) -> Proposed:
-        """The question to an RC: some of its holders may be bookings."""
+        """The question to an RC. Some of the proposed holders may be bookings."""
         holders = []
         for name, params in asked.holders.items():
             if (arc := self._core.arc(name)) is not None:
@@ -344,26 +347,26 @@ class BookingHandler:
     # Taking up
 
     def take_up(self, ask: Ask, sender: Sender) -> str:
-        """The date that an ARC takes up, as the core calls it; empty where one that goes on finds it over. To that one
-        it may be that it is not known here yet. Raises Refused."""
+        """The core's name of the date that a request uses. An ARC that continues may name a date that is not known here
+        yet; empty if its date is over. Raises Refused."""
         booking, _, start = ask.booking.partition("@")
         record = self._records.get(booking)
-        goes_on = ask.place is not None or ask.grant is not None
+        continues = ask.place is not None or ask.grant is not None
         if record is None or record.unbooked:
-            if goes_on:
+            if continues:
                 return ask.booking if record is None and start_of(ask.booking) is not None else ""
             raise Refused("unknown_booking", f"no booking {booking}, or it was cancelled; see zscout booking list")
         self._admission.check_take_up(ask, sender, record)
-        dates_ = [date for date in self._dates.standing(record) if not start or str(date.start) == start]
+        dates_ = [date for date in self._dates.dates_in_core(record) if not start or str(date.start) == start]
         free = [date for date in dates_ if (kept := self._core.booking(date.id)) is None or kept.arc is None]
         if free:
             return free[0].id
-        if goes_on:
+        if continues:
             return next((date.id for date in self._dates.open_dates(record) if str(date.start) == start), "")
         why = "another request uses it" if dates_ else "its dates are over, or another booking takes precedence"
         raise Refused("unknown_booking", f"booking {record.name} can't be used: {why}; see zscout booking list")
 
-    # Telling
+    # For people and programs
 
     def views(self, owner: str | None = None, rc: str | None = None) -> list[BookingView]:
         views = []

@@ -1,6 +1,6 @@
-"""The leader and all who keep bookings: what one has and another has not comes to both.
+"""Exchanges booking records between the leader and all keepers, until all have the same.
 
-A booking is kept once another candidate has it; where there is none, once this one's disk has."""
+A booking is kept once another candidate has stored it; without other candidates, once this host's disk has it."""
 
 from __future__ import annotations
 
@@ -27,37 +27,37 @@ from zscout.types import SECOND, HostName, Ns, Term
 log = logging.getLogger(__name__)
 
 SHARE_EVERY: Final = 30.0
-"""Seconds from one question to all keepers to the next, where nothing is new."""
-AGAIN: Final = 5.0
-"""The same where some host does not know the same yet."""
-SOON: Final = 0.02
-"""Seconds that changes are gathered before they are shared."""
+"""Seconds between questions to all keepers while nothing changes."""
+SHARE_AGAIN: Final = 5.0
+"""Seconds between questions while some host differs."""
+GATHER: Final = 0.02
+"""Seconds for which changes are gathered before they are shared."""
 TIMEOUT: Final = 2.0
 PROMPT: Final[Ns] = SECOND
-"""The clock of a host counts as it is read within this time: if it took longer, the answer may have waited."""
-LOOK_AT_CLOCK: Final = 1.0
-"""Seconds from one look at the own clock to the next: if it was set, all are asked what theirs say."""
+"""Only answers within this time are readings of a host's clock: later ones may have waited in a queue."""
+CLOCK_PERIOD: Final = 1.0
+"""Seconds between checks of the own clock: if it was set, all hosts are asked for theirs."""
 STEADY: Final[Ns] = 600 * SECOND
-"""Bookings are forgotten by a fleet time that was not set for so long: it may be days ahead."""
+"""Records are forgotten only if fleet time was not set for this long, as it may be days ahead at first."""
 LOOK: Final = 0.5
-"""Seconds within which candidates that live are found."""
+"""Seconds for finding the tokens of other candidates."""
 
 
 def credible(replies: Iterable[Reply[BookingsKept]], keys: Keys, now: Ns) -> list[BookingsKept]:
-    """What keepers answered, each for its own host, with the times of `now`: some have waited for the others."""
-    told = [(reply, reply.message) for reply in replies if reply.message is not None]
-    own = [(now - reply.arrived, message) for reply, message in told if reply.key == keys.bookings(message.host)]
+    """The answers that keepers gave for their own hosts, with all times brought forward to `now`."""
+    answers = [(reply, reply.message) for reply in replies if reply.message is not None]
+    own = [(now - reply.arrived, message) for reply, message in answers if reply.key == keys.bookings(message.host)]
     return [_aged(message, waited / SECOND) for waited, message in own]
 
 
-def _aged(one: BookingsKept, seconds: float) -> BookingsKept:
-    if one.time is None:
-        return replace(one, wall=one.wall + seconds)
-    return replace(one, wall=one.wall + seconds, time=one.time + seconds, time_age=one.time_age + seconds)
+def _aged(answer: BookingsKept, seconds: float) -> BookingsKept:
+    if answer.time is None:
+        return replace(answer, wall=answer.wall + seconds)
+    return replace(answer, wall=answer.wall + seconds, time=answer.time + seconds, time_age=answer.time_age + seconds)
 
 
 class BookingSharing:
-    """Of one term. What comes of it is given to `take`: records, fleet times and clocks of hosts."""
+    """The exchange in one term. `take` receives the stimuli: new records, fleet times and clocks of hosts."""
 
     def __init__(
         self,
@@ -70,20 +70,20 @@ class BookingSharing:
         take: Callable[[steps.Stimulus], None],
     ) -> None:
         self._mesh, self._term, self._keeper, self._authority = mesh, term, keeper, authority
-        self._bookings, self._supervisor, self._give = bookings, supervisor, take
+        self._bookings, self._supervisor, self._on_stimulus = bookings, supervisor, take
         self._declared: list[Declaration] = []
         self._unshared: dict[str, BookingRecord] = {}
         self._behind = True
-        """Whether some host may not have all that is known here."""
+        """True while some host may lack records that are known here."""
         self._not_kept: dict[str, str] = {}
-        """By booking: why it is not kept, as it was told last."""
+        """By booking: the reason that the last exchange did not get it kept."""
         self._news = asyncio.Event()
         self._sharing = asyncio.Lock()
         self._ahead: dict[HostName, Ns] = {}
-        """By how much hosts' clocks are ahead of the own monotonic one, as they were read last."""
+        """By host: its clock less the own monotonic clock, at the last reading."""
 
     def start(self) -> None:
-        """From now on it answers, and shares what it knows."""
+        """Start answering and sharing."""
         keys, mesh, guard = self._mesh.keys, self._mesh, self._supervisor.guard
         self._declared = [
             *(
@@ -103,7 +103,7 @@ class BookingSharing:
 
     @property
     def bookings(self) -> Bookings:
-        """At the present time."""
+        """The bookings, set to the present time."""
         return self._bookings.at(self._mesh.now())
 
     def _answer(self, query: IncomingQuery[BookingsAsk]) -> None:
@@ -117,7 +117,7 @@ class BookingSharing:
         return Correction(by / SECOND, ago) if by and ago < DAY else None
 
     def _clocks(self) -> dict[HostName, float]:
-        """By how many seconds hosts' clocks differ from fleet time, where it is too much."""
+        """By host: seconds by which its clock differs from fleet time, if that is too much."""
         fleet = self._bookings.dates.to_fleet(0)
         differ = {host: (ahead - fleet) / SECOND for host, ahead in self._ahead.items()}
         return {host: seconds for host, seconds in differ.items() if abs(seconds) > DIFFERS}
@@ -126,19 +126,19 @@ class BookingSharing:
         if alive and token.host != self._mesh.me.host:
             self.catch_up()
 
-    def tell(self, records: Iterable[BookingRecord]) -> None:
-        """These are not as they were: shared soon."""
+    def share_soon(self, records: Iterable[BookingRecord]) -> None:
+        """Share changed records soon."""
         if changed := {record.id: record for record in records}:
             self._unshared |= changed
             self._news.set()
 
     def catch_up(self) -> None:
-        """A host has come that may know less, or more."""
+        """Exchange all records soon: a host has appeared that may have fewer, or more."""
         self._behind = True
         self._news.set()
 
     async def keep(self, record: BookingRecord) -> str:
-        """Returns once this is kept: empty, or why it is not."""
+        """Get a record kept. Return the reason if that fails; empty: it is kept."""
         self._unshared[record.id] = record
         async with self._sharing:
             if record.id in self._unshared:
@@ -146,12 +146,12 @@ class BookingSharing:
             return self._not_kept.get(record.id, "")
 
     async def _watch_others(self) -> None:
-        """One that led elsewhere shares its bookings before it steps down."""
+        """Take over the records that another leader shared before it stepped down."""
         while True:
             await self._keeper.shared.wait()
             self._keeper.shared.clear()
             self.catch_up()
-            self._give(steps.Shared())
+            self._on_stimulus(steps.Shared())
 
     async def _watch_clock(self) -> None:
         ahead: Ns | None = None
@@ -159,12 +159,12 @@ class BookingSharing:
             before, ahead = ahead, wall_ns(self._keeper.wall()) - self._mesh.now()
             if before is not None and abs(ahead - before) > DIFFERS * SECOND:
                 self._news.set()
-            await asyncio.sleep(LOOK_AT_CLOCK)
+            await asyncio.sleep(CLOCK_PERIOD)
 
     async def _keep_sharing(self) -> None:
         while True:
-            if await done_within(AGAIN if self._behind else SHARE_EVERY, self._news.wait()):
-                await asyncio.sleep(SOON)
+            if await done_within(SHARE_AGAIN if self._behind else SHARE_EVERY, self._news.wait()):
+                await asyncio.sleep(GATHER)
             self._news.clear()
             async with self._sharing:
                 why = await self._share()
@@ -172,13 +172,13 @@ class BookingSharing:
                 log.warning("bookings are kept by this host alone: %s", why)
 
     async def _share(self) -> str:
-        """Tells all keepers, and hears what they know. Returns why what was told is not kept; empty: it is."""
+        """Exchange records with all keepers. Return the reason if the changed records are not kept; else empty."""
         keeper, mesh = self._keeper, self._mesh
         sent, self._unshared = self._unshared, {}
         asked = mesh.now()
         time = self.bookings.time if asked - self._bookings.clock.set_at >= STEADY else None
         if time is not None:
-            # All forget by the time of one question: else what one has forgotten came back from another.
+            # All keepers forget by the time in this question, so that no record returns from a keeper.
             keeper.records.forget_old(time)
         records = list(keeper.records) if self._behind else list(sent.values())
         question = ShareBookings(self._term, keeper.records.digest(), records, time)
@@ -186,26 +186,28 @@ class BookingSharing:
             keeper.save(), mesh.ask(mesh.keys.bookings_any, question, BookingsKept, timeout=TIMEOUT)
         )
         answers, me, why = self._take(replies, question, asked), mesh.me.host, ""
-        if sent and not any(one.candidate and one.host != me and _keeps(one, question, sent) for one in answers):
+        if sent and not any(
+            other.candidate and other.host != me and _keeps(other, question, sent) for other in answers
+        ):
             living = await mesh.living(mesh.keys.alive_any(Role.CANDIDATE), timeout=LOOK)
             if others := sorted({token.host for token in living} - {me}):
-                why = f"{', '.join(others[:3])} may lead as well, and did not take it"
+                why = f"{', '.join(others[:3])} may lead as well, and did not store it"
             elif not saved:
-                why = "no other host may lead, and this one has no disk for it: is its `state` a folder to write to?"
+                why = "no other host may lead, and this host can't write it; make its `state` a writable folder"
         for booking in sent:
             self._not_kept.pop(booking, None)
         self._not_kept |= dict.fromkeys(sent, why) if why else {}
         return why
 
     def _take(self, replies: Collection[Reply[BookingsKept]], question: ShareBookings, asked: Ns) -> list[BookingsKept]:
-        """What keepers answered to what they were `asked` then."""
+        """Take over the answers to a question that was `asked` at that time. Return those of hosts that may lead."""
         now = self._mesh.now()
         heard = credible(replies, self._mesh.keys, now)
-        answers = [one for one in heard if self._authority.may_lead(one.host)]
-        changed = self._keeper.records.take(record for one in answers for record in one.records)
+        answers = [answer for answer in heard if self._authority.may_lead(answer.host)]
+        changed = self._keeper.records.take(record for answer in answers for record in answer.records)
         known = {record.id: record for record in self._keeper.records}
         latest = replace(question, digest=self._keeper.records.digest())
-        # One that is not believed may have more, which changes nothing here.
+        # Further records of a host that is not believed change nothing here.
         self._behind = any(
             reply.message is None
             or (
@@ -216,22 +218,22 @@ class BookingSharing:
             for reply in replies
         )
         if changed:
-            self._give(steps.Shared())
+            self._on_stimulus(steps.Shared())
             self._news.set()
         prompt = credible((reply for reply in replies if reply.arrived - asked <= PROMPT), self._mesh.keys, now)
-        hosts = {one.host: one for one in (*prompt, self._keeper.told("", durable=False))}
-        walls = {host: wall_ns(one.wall) for host, one in hosts.items()}
+        hosts = {answer.host: answer for answer in (*prompt, self._keeper.told("", durable=False))}
+        walls = {host: wall_ns(answer.wall) for host, answer in hosts.items()}
         self._ahead = {host: wall - now for host, wall in walls.items()}
-        believed = {*(one.host for one in answers), self._mesh.me.host}
-        mine = {host: wall for host, wall in walls.items() if host in believed}
-        kept = frozenset(host for host in mine if hosts[host].synchronised)
-        self._give(steps.ClocksRead(now, oldest(answers), mine, kept))
+        believed = {*(answer.host for answer in answers), self._mesh.me.host}
+        believed_walls = {host: wall for host, wall in walls.items() if host in believed}
+        kept = frozenset(host for host in believed_walls if hosts[host].synchronised)
+        self._on_stimulus(steps.ClocksRead(now, oldest(answers), believed_walls, kept))
         return answers
 
 
-def _keeps(one: BookingsKept, question: ShareBookings, sent: Mapping[str, BookingRecord]) -> bool:
-    """Whether that host knows all that it was `sent`: there may be no room for it."""
-    if one.digest == question.digest:
+def _keeps(answer: BookingsKept, question: ShareBookings, sent: Mapping[str, BookingRecord]) -> bool:
+    """Return True if that host has all records that it was `sent`: it may have no room for them."""
+    if answer.digest == question.digest:
         return True
-    known = {record.id: record for record in one.records}
+    known = {record.id: record for record in answer.records}
     return all(id_ in known and merged(known[id_], record) == known[id_] for id_, record in sent.items())

@@ -1,5 +1,5 @@
 """Bookings in one term: fleet time, the dates in the core, dangers, and operations. Values in and out; the present time
-is passed in (`at`). Who keeps them, and whom that is asked, is `booking_sharing.py`."""
+is passed in (`at`). The exchange with keepers is in `booking_sharing.py`."""
 
 from __future__ import annotations
 
@@ -27,30 +27,30 @@ from zscout.services.rcm.booking_handler import BookingHandler
 from zscout.types import SECOND, HostName, Ns, span
 
 SLACK: Final[Ns] = SECOND // 100
-"""Timers may be a little early."""
-BALLOTS: Final[Ns] = SECOND // 500
-"""Ballots on a booking are gathered for so long: one for each of its dates."""
-GATHERS: Final[Ns] = SECOND
-"""Bookings are gathered for so long before it is found out when there is one more date of them to keep."""
-LASTS: Final[Ns] = 3 * SECOND
-"""A danger may pass within this time: after a change of leader RCs come one after the other."""
+"""Added to deadlines, as timers may be a little early."""
+BALLOTS_DELAY: Final[Ns] = SECOND // 500
+"""For gathering the ballots on a booking, one for each of its dates."""
+DATE_REFRESH_DELAY: Final[Ns] = SECOND
+"""For gathering changes before the next dates of repeated bookings are computed."""
+DANGER_DELAY: Final[Ns] = 3 * SECOND
+"""A danger is reported if it lasts for this time: after a change of leader, RCs join one after the other."""
 
 
 class _Due(Enum):
-    NEWS = auto()
-    ANOTHER = auto()
-    """What is repeated may have one more date within 60 days."""
-    LOOK = auto()
-    """It is found out when that is."""
+    RECONCILE = auto()
+    NEXT_DATE = auto()
+    """A repeated booking may have one more date within 60 days."""
+    REFRESH = auto()
+    """The times of `NEXT_DATE` and `RENEW` must be computed."""
     RENEW = auto()
-    """Maintenance without an end is to be put off."""
-    TRY = auto()
-    TELL = auto()
+    """Maintenance without an end must be extended."""
+    RETRY = auto()
+    DANGERS = auto()
 
 
 class Bookings:
-    """`drained`: the hosts in maintenance. Before `settles_at` not all dates of the fleet are known: after a restart of
-    all its hosts, each knows its own only."""
+    """The bookings of one term. `drained`: the hosts in maintenance. Before `settles_at` some dates of the fleet may be
+    unknown: after a restart of all hosts, each knows only its own records."""
 
     def __init__(
         self,
@@ -70,42 +70,42 @@ class Bookings:
         self.handler = BookingHandler(fleet, core, records, self.dates, admission, device_check, runtimes)
         self._deadlines: Deadlines[tuple[_Due, Any]] = Deadlines()
         self._set: set[_Due] = set()
-        """Those of which there is one at a time."""
-        self._another: Ns | None = None
+        """Deadlines of kinds that are set only once at a time."""
+        self._next_date: Ns | None = None
         self._renewal: Ns | None = None
-        self._is_found_out = settles_at > 0
-        """True while fleet time is what hosts' clocks say, as nobody has heard it."""
-        self._told: dict[str, str] = {}
-        """Dangers that were reported, by date."""
-        self._once(_Due.NEWS, 0)
+        self._by_clocks = settles_at > 0
+        """True while fleet time is the median of the hosts' clocks, as no host has a fleet time from before."""
+        self._reported: dict[str, str] = {}
+        """By date: the danger that was reported last."""
+        self._once(_Due.RECONCILE, 0)
         if settles_at:
-            self._deadlines.set(settles_at + SLACK, (_Due.NEWS, None))
+            self._deadlines.set(settles_at + SLACK, (_Due.RECONCILE, None))
 
     def at(self, now: Ns) -> Self:
-        """The present time is `now`."""
+        """Set the present time."""
         self.dates.now = now
         return self
 
     @property
     def settled(self) -> bool:
-        """Whether the dates of the fleet are known."""
+        """Return True if all dates of the fleet are known."""
         return self.dates.now >= self.settles_at
 
     @property
     def time(self) -> float | None:
-        """Fleet time, in seconds since 1970 (UTC), as others may go by it; None: it is not settled."""
+        """Fleet time for heartbeats, in seconds since 1970 (UTC); None: it is not settled."""
         return self.dates.time if self.settled else None
 
     @property
     def age(self) -> float:
-        """For how many seconds that time has gone on."""
+        """Seconds for which fleet time has run."""
         return (self.dates.now - self.clock.since) / SECOND
 
     @property
     def next(self) -> Ns | None:
         return self._deadlines.next
 
-    # What is known
+    # Reading
 
     def take_up(self, ask: Ask, sender: Sender) -> str:
         return self.handler.take_up(ask, sender)
@@ -117,13 +117,13 @@ class Bookings:
         return self._records.get(booking)
 
     def recovered(self, taken: Collection[str]) -> Sequence[Event]:
-        """The events by which the core knows of all dates; `taken`: those that ARCs have taken up."""
+        """The events with all dates for the core; `taken`: dates that ARCs have taken up."""
         return [self.dates.recovered(taken)]
 
     def proposal(self, asked: Propose) -> Proposed:
         return self.handler.proposal(asked)
 
-    # What happens
+    # Stimuli
 
     def operation(self, ticket: Ticket, sender: Sender, operation: Operation) -> Outbox:
         try:
@@ -142,8 +142,8 @@ class Bookings:
             self.dates.out.answers.append((ticket, Problem("bad_name", str(error))))
         return self._out()
 
-    def again(self, again: RetryBooking) -> Outbox:
-        self.handler.again(again.undecided)
+    def retry(self, again: RetryBooking) -> Outbox:
+        self.handler.retry(again.undecided)
         return self._out()
 
     def kept(self, keep: Keep, why: str) -> Outbox:
@@ -151,63 +151,63 @@ class Bookings:
         return self._out()
 
     def shared(self) -> Outbox:
-        """Others know what was not known here."""
+        """Keepers sent records that were unknown here."""
         self._once(_Due.NEWS, 0)
         return self._out()
 
     def set_clock(self, read: ClocksRead) -> Outbox:
-        """Set fleet time by what hosts have heard of it, and by their clocks."""
+        """Set fleet time by the fleet times that hosts received from leaders, and by their clocks."""
         clock, (at, heard, walls, kept) = self.clock, read
         if heard is not None and heard[0] > self.age + SAME:
-            # This reign began where nobody knew the time of the others.
-            clock.since, self._is_found_out = at - round(heard[0] * SECOND), False
+            # This term began without the fleet time of these hosts.
+            clock.since, self._by_clocks = at - round(heard[0] * SECOND), False
             clock.step(heard[1], at)
-        elif self._is_found_out and not self.settled:
+        elif self._by_clocks and not self.settled:
             clock.step(agreed(walls.values(), kept=[walls[host] for host in kept]), at)
         elif moved := clock.correct(walls, at, kept):
             words = f"{span(abs(moved) / SECOND)} {'forward' if moved > 0 else 'back'}"
-            self.dates.out.strange.append(("clock", f"fleet time is put {words}, to what most hosts' clocks say"))
+            self.dates.out.strange.append(("clock", f"fleet time is put {words}, to the time of most hosts' clocks"))
         if self.dates.redate(settled=self.settled):
             self._reconcile()
         return self._out()
 
     def note(self, events: Collection[Event], effects: Iterable[Effect]) -> Outbox:
-        """What has happened in an instant: what follows of it follows in another one."""
+        """Take over the events and effects of an instant. Their consequences belong to later instants."""
         if self.dates.note(effects, settled=self.settled):
             self._once(_Due.NEWS, 0)
         kinds = {*map(type, events), *map(type, effects)}
         if kinds & {BookingThreatened, BookingConflict}:
-            self._tell_soon()
+            self._report_later()
         if Dates in kinds:
-            self._once(_Due.LOOK, GATHERS)
+            self._once(_Due.REFRESH, DATE_REFRESH_DELAY)
         if (drained := self._core.drained()) != self.drained:
             self.drained = drained
             self.dates.out.drained.append(drained)
         if self.handler.undecided and kinds & {Vote, VoteOverdue}:
-            self._once(_Due.TRY, BALLOTS)
+            self._once(_Due.RETRY, BALLOTS_DELAY)
         return self._out()
 
     def tick(self) -> Outbox:
-        """Carries out what is due."""
+        """Carry out the deadlines that are over."""
         while (due := self._deadlines.pop_due(self.dates.now)) is not None:
             self._set.discard(due[0])
             match due:
-                case (_Due.NEWS, _):
+                case (_Due.RECONCILE, _):
                     self._reconcile()
-                case (_Due.ANOTHER, at) if at == self._another:
-                    self._another = None
-                    self._once(_Due.NEWS, 0)
+                case (_Due.NEXT_DATE, at) if at == self._next_date:
+                    self._next_date = None
+                    self._once(_Due.RECONCILE, 0)
                 case (_Due.RENEW, at) if at == self._renewal and self.settled:
                     self.dates.renew()
-                    self._once(_Due.NEWS, 0)
-                case (_Due.LOOK, _):
-                    self._await_another()
-                case (_Due.TRY, _):
+                    self._once(_Due.RECONCILE, 0)
+                case (_Due.REFRESH, _):
+                    self._refresh_dates()
+                case (_Due.RETRY, _):
                     again, self.handler.undecided = self.handler.undecided, []
                     self.dates.out.then += map(RetryBooking, again)
                     self.dates.out.events += [Tick()] if again else []
-                case (_Due.TELL, _):
-                    self._tell()
+                case (_Due.DANGERS, _):
+                    self._report_dangers()
         return self._out()
 
     def _once(self, due: _Due, delay: Ns) -> None:
@@ -221,31 +221,31 @@ class Bookings:
 
     def _reconcile(self) -> None:
         self.dates.out.events.append(self.dates.reconcile())
-        self._tell_soon()
-        self._await_another()
+        self._report_later()
+        self._refresh_dates()
 
-    def _await_another(self) -> None:
-        """What is repeated is to have its dates in time, and maintenance without an end is to last."""
+    def _refresh_dates(self) -> None:
+        """Set the deadlines for the next date of repeated bookings, and for extending maintenance without an end."""
         renewal, self._renewal = self.dates.until_renewal(), None
         if math.isfinite(renewal):
             self._renewal = self.dates.now + round(max(0.0, renewal) * SECOND) + SLACK
             self._deadlines.set(self._renewal, (_Due.RENEW, self._renewal))
-        until, self._another = self.dates.until_another(), None
+        until, self._next_date = self.dates.until_next_date(), None
         if math.isfinite(until):
-            self._another = self.dates.now + round(max(0.0, until) * SECOND) + SLACK
-            self._deadlines.set(self._another, (_Due.ANOTHER, self._another))
+            self._next_date = self.dates.now + round(max(0.0, until) * SECOND) + SLACK
+            self._deadlines.set(self._next_date, (_Due.NEXT_DATE, self._next_date))
 
-    def _tell_soon(self) -> None:
-        if self.dates.dangers() != self._told:
-            self._once(_Due.TELL, LASTS)
+    def _report_later(self) -> None:
+        if self.dates.dangers() != self._reported:
+            self._once(_Due.DANGERS, DANGER_DELAY)
 
-    def _tell(self) -> None:
-        """Reports what is not as it was reported last, and has been so for a while: the next dates first, as there are
-        bounds to what people get, and once for all dates of a booking."""
-        before, self._told = self._told, self.dates.dangers()
+    def _report_dangers(self) -> None:
+        """Report dangers that changed since the last report: one report for all dates of a booking, the next dates
+        first, as the number of notices to people is bounded."""
+        before, self._reported = self._reported, self.dates.dangers()
         news = dict[tuple[str, str], list[Date]]()
-        for name in before.keys() | self._told.keys():
-            why, date = self._told.get(name, ""), self.dates.date(name)
+        for name in before.keys() | self._reported.keys():
+            why, date = self._reported.get(name, ""), self.dates.date(name)
             if why != before.get(name, "") and date is not None:
                 news.setdefault((date.record.id, why), []).append(date)
         found = [
@@ -264,39 +264,41 @@ def bookings_of(
     kept: Sequence[BookingsKept],
     runtimes: RuntimeEstimator | None,
 ) -> Bookings:
-    """Those of a new term. `kept`: what keepers answered as the lead was taken."""
+    """The bookings of a new term. `kept`: the answers of keepers to the takeover."""
     now, known = keeper.mesh.now(), _is_known(keeper, kept, fleet)
     time, age = _time(keeper, kept)
-    keeper.records.take(record for told in kept for record in told.records)
+    keeper.records.take(record for answer in kept for record in answer.records)
     clock, settles_at = FleetClock(time, now, now - round(age * SECOND)), now + round(fleet.mesh.lease * SECOND)
     return Bookings(fleet, core, admission, device_check, keeper.records, clock, runtimes, 0 if known else settles_at)
 
 
 def oldest(answers: Iterable[BookingsKept]) -> tuple[float, Ns] | None:
-    """Of the fleet times that hosts have heard the one that has gone on for longest: for how many seconds, and it. Of
-    two that did, as some hosts missed a correction, what more have heard, or what is nearer to their clocks."""
-    heard = [one for one in answers if one.time is not None]
-    age = max((one.time_age for one in heard), default=None)
+    """The fleet time that has run longest at any host: seconds for which it has run, and the time. If some hosts missed
+    a correction, so that two times have run equally long, the time of more hosts, else the time nearer to their
+    clocks."""
+    heard = [answer for answer in answers if answer.time is not None]
+    age = max((answer.time_age for answer in heard), default=None)
     if age is None:
         return None
-    times = [wall_ns(one.time) for one in heard if one.time is not None and one.time_age > age - SAME]
-    return age, agreed(times, agreed(wall_ns(one.wall) for one in heard))
+    times = [wall_ns(answer.time) for answer in heard if answer.time is not None and answer.time_age > age - SAME]
+    return age, agreed(times, agreed(wall_ns(answer.wall) for answer in heard))
 
 
 def _time(keeper: BookingKeeper, kept: Sequence[BookingsKept]) -> tuple[Ns, float]:
-    """Fleet time, and for how many seconds it has gone on: the oldest that was heard, here or elsewhere. Where nobody
-    has heard any it is found out now: the median of the clocks."""
+    """Fleet time, and the seconds for which it has run: the oldest of any host; if no host has one, the median of the
+    hosts' clocks, from now on."""
     found = oldest([*kept, keeper.told("", durable=False)])
     if found is not None:
         return found[1], found[0]
-    hosts = {one.host: one for one in (*kept, keeper.told("", durable=False))}.values()
+    hosts = {answer.host: answer for answer in (*kept, keeper.told("", durable=False))}.values()
     return agreed(
-        (wall_ns(one.wall) for one in hosts), kept=[wall_ns(one.wall) for one in hosts if one.synchronised]
+        (wall_ns(host.wall) for host in hosts), kept=[wall_ns(host.wall) for host in hosts if host.synchronised]
     ), 0.0
 
 
 def _is_known(keeper: BookingKeeper, kept: Sequence[BookingsKept], fleet: Fleet) -> bool:
-    if keeper.time is not None or any(one.time is not None for one in kept):
+    """Return True if fleet time is known anywhere, or most candidates of the fleet file have answered."""
+    if keeper.time is not None or any(answer.time is not None for answer in kept):
         return True
-    answered = {keeper.mesh.me.host, *(one.host for one in kept)} & {*fleet.candidates}
+    answered = {keeper.mesh.me.host, *(answer.host for answer in kept)} & {*fleet.candidates}
     return 2 * len(answered) > len(fleet.candidates) > 0

@@ -1,8 +1,8 @@
-"""A node's candidacy for the RCM: sees whether an RCM leads, and takes over when none does.
+"""A node's candidacy for the RCM: watches for a leader, and takes over when there is none.
 
-Taking over: ask the RCs whether they still see a leader; take a term above all that is known; ask all RCs and clients
-for their holds and requests, which binds the RCs to the new term; lead over that. When anything of it fails, a
-candidate steps down: its tokens go, so that others take over, and after a while it becomes a candidate again."""
+Takeover: ask the RCs if they still see a leader; take a term above all known terms; ask all RCs and clients for their
+holds and requests, which binds the RCs to the new term; lead with the recovered state. When anything fails, a candidate
+withdraws its tokens, so that others take over, and becomes a candidate again after a while."""
 
 from __future__ import annotations
 
@@ -58,38 +58,38 @@ UNSEEN = "RCs of other hosts see an RCM, and this candidate does not"
 
 
 class CandidateParts(NamedTuple):
-    """What a node gives its candidate."""
+    """Parts of a node that its candidate uses."""
 
     folder: Path | None = None
-    """Where it keeps what it must know after a restart."""
+    """The folder for facts that outlive a restart."""
     authority: Authority | None = None
     places_key: bytes | None = None
-    """By which the managers of a fleet seal places."""
+    """The key with which the managers of a fleet seal places."""
     listeners: Sequence[HoldListener] = ()
-    """Get to know of holds while it leads."""
+    """Notified of holds while it leads."""
     journal: Journal | None = None
-    """Gets to know of publications."""
+    """Receives all believed publications."""
     runtimes: RuntimeObserver | None = None
     keeper: BookingKeeper | None = None
-    """Keeps bookings; without one they are kept in memory."""
+    """Stores bookings; without a keeper they are in memory only."""
     disk: TermDisk | None = None
-    """Keeps the highest term of a fleet with `[security]`."""
+    """Stores the highest term of a fleet with `[security]`."""
     on_danger: Callable[[BookedDanger], object] = lambda _: None
-    """Called while it leads with bookings that may not be kept."""
+    """Called while it leads, with bookings that may not be kept."""
 
 
 class _Candidacy(NamedTuple):
-    """From a start to its failure, or the end of the node."""
+    """The time from a start to its failure, or to the end of the node."""
 
     supervisor: Supervisor
     last_terms: LastTerms
     stall: StallWatch
     declared: ExitStack
-    """Undeclares what is declared meanwhile."""
+    """Undeclares everything that the candidacy declared."""
 
 
 class Candidate:
-    """Stands by, leads when it must, steps down when a higher term is seen or when anything fails."""
+    """Waits, leads when there is no leader, steps down when a higher term is seen or anything fails."""
 
     def __init__(self, mesh: Mesh, fleet: Fleet, parts: CandidateParts | None = None) -> None:
         self._parts = parts = parts or CandidateParts()
@@ -103,22 +103,22 @@ class Candidate:
         self.rcm: Rcm | None = None
         self.balancer: LoadBalancer | None = None
         self.placer: ComponentPlacer | None = None
-        """These two are beside the RCM, while this node leads."""
+        """Balancer and placer run beside the RCM, while this node leads."""
         self.terms_led = 0
         self.tally = Tally()
-        """How operations ended that its RCMs were asked for."""
+        """Counts the results of operations at its RCMs."""
         self.ledger = PlacementLedger(mesh)
         self._authority.placed = self.ledger.placements
         self.inventory = Inventory(mesh, fleet, parts.folder)
         self._leading = ExitStack()
-        """Ends the RCM, and the load balancer and the placer beside it, while this node leads."""
+        """Ends the RCM, load balancer and placer when this node stops leading."""
         self._changed = asyncio.Event()
         self._setbacks = Setbacks()
         self._again: asyncio.TimerHandle | None = None
 
     @property
     def known(self) -> Term:
-        """The highest term that it believes."""
+        """The highest believed term."""
         return self.terms.highest
 
     @property
@@ -132,7 +132,7 @@ class Candidate:
         await self._candidacy.supervisor.close()
 
     def start(self) -> None:
-        """Becomes a candidate, the first time or again: others see its token from now on."""
+        """Become a candidate, the first time or again: others see its token from now on."""
         keys, mesh = self.mesh.keys, self.mesh
         self._again, now, silence = None, mesh.now(), self.fleet.silence
         self._setbacks.began(now)
@@ -165,7 +165,7 @@ class Candidate:
             self.rcm.on_reload()
 
     def _failed(self, _: Exception) -> None:
-        """Steps down and withdraws; becomes a new candidate after a while."""
+        """Withdraw, and become a candidate again after a while."""
         if self._again is not None:
             return
         delay = self._setbacks.delay(self.mesh.now())
@@ -182,11 +182,11 @@ class Candidate:
         self.rcm = self.balancer = self.placer = None
         self._leading.close()
 
-    # What is seen
+    # Observations
 
     def _on_grants(self, _key: str, grants: Grants) -> None:
         known = grants.term == self.known and (self.rcm is None or self.rcm.term == self.known)
-        if known or self._see(Word(grants.term, Source.LEADER)).believed:
+        if known or self._weigh(Word(grants.term, Source.LEADER)).believed:
             self.terms.led(grants.term, self.mesh.now())
             self.election.published(grants.term, self.mesh.now())
             self.learned.hear(self.mesh.now(), grants)
@@ -203,8 +203,8 @@ class Candidate:
         self.election.candidate(token.host, alive=alive, now=self.mesh.now())
         self._changed.set()
 
-    def _see(self, word: Word) -> Verdict:
-        """A term was shown. A leader steps down below one that it believes."""
+    def _weigh(self, word: Word) -> Verdict:
+        """Judge evidence of a term. A leader steps down if it believes a higher term than its own."""
         now, before = self.mesh.now(), self.known
         heard = self.rcm is not None or self.election.heard_within(self.fleet.timing.hold_lease, now)
         verdict = self.terms.weigh(word, now, heard=heard)
@@ -220,12 +220,12 @@ class Candidate:
         return verdict
 
     def _disbelieved(self, rc: RcName, term: Term) -> None:
-        """The own RCM has no RC, and one that obeys another takes its term for a forgery."""
+        """Step down: the own RCM has no RC, and an RC of another leader considers its term absurd."""
         if self.rcm is not None:
             self._step_down(f"{rc} hears an RCM of term {term.counter}, and does not believe {self.rcm.term.counter}")
 
     def _step_down(self, why: str, *, led: bool = True) -> None:
-        """`led`: somebody is known to lead, or may be for all that is known."""
+        """`led`: the higher term is known to have a leader, or may have one."""
         log.warning("stepping down: %s", why)
         self.election.deposed(self.mesh.now(), RANDOM.get().uniform(0.7, 1.3), led=led)
         self._stop_leading()
@@ -248,10 +248,10 @@ class Candidate:
             await done_within(None if at is None else (at - now) / SECOND, self._changed.wait())
 
     async def _leader_elsewhere(self) -> bool:
-        """Whether RCs still see a leader: then it is this candidate that is cut off; or have promised a term to a
-        candidate that may be about to lead."""
+        """Return True if RCs still see a leader, as this candidate is then cut off; or if they have promised a term to
+        another candidate, which may be about to lead."""
         if self._candidacy.stall.fresh():
-            self.election.stood_still(self.mesh.now())
+            self.election.stalled(self.mesh.now())
         keys, tokens = self.mesh.keys, list[Token]()
         asked = self.mesh.ask(keys.rc_state_any, RcAsk(), RcState, timeout=self._timeout)
         if self.terms.secured:
@@ -261,12 +261,12 @@ class Candidate:
             replies = await asked
         states = [state for state, _ in self._credible(replies, lambda state: keys.rc_state(state.rc))]
         before = self.known
-        heard = self._hear_rcs(states, tokens)
+        heard = self._weigh_rcs(states, tokens)
         if self.known > before:
-            self.election.rivalled(self.mesh.now())
+            self.election.outbid(self.mesh.now())
             return True
         states, now = [state for _, state in heard], self.mesh.now()
-        self.terms.goes_above |= await self._divided(states)
+        self.terms.goes_above |= await self._has_absurd_term(states)
         others, own = views(((host, state.leader) for host, state in heard), self.mesh.me.host)
         if self.terms.secured and self._is_disbelieved(others, heard, now):
             others = dict.fromkeys(others, False)
@@ -278,7 +278,7 @@ class Candidate:
         return False
 
     def _is_disbelieved(self, others: Mapping[HostName, bool], heard: list[tuple[HostName, RcState]], now: Ns) -> bool:
-        """Return True if only one other host answers, and nobody else saw the leader that it shows."""
+        """Return True if only one other host answers, and no other evidence of the leader that it shows appeared."""
         if self.election.waited_in_vain(others, now):
             [host] = others
             if host and not self.terms.doubted_until(host, now):
@@ -287,29 +287,30 @@ class Candidate:
             return True
         return len(others) == 1 and all(self.terms.is_doubted(host, now, self.fleet.silence) for host in others)
 
-    def _hear_rcs(self, states: list[RcState], tokens: list[Token]) -> list[tuple[HostName, RcState]]:
-        """Take the terms of RCs. Return those that do not count as absent for what they show, each with its host: with
-        `[security]` that of its token."""
+    def _weigh_rcs(self, states: list[RcState], tokens: list[Token]) -> list[tuple[HostName, RcState]]:
+        """Judge the terms of RCs. Return the RCs that do not count as absent because of their terms, each with its
+        host: with `[security]` the host of its token."""
         seen = {(token.host, token.name, token.instance) for token in tokens}
         now, silence = self.mesh.now(), self.fleet.silence
         heard = list[tuple[HostName, RcState]]()
         for state in states:
             proven = state.host if (state.host, state.rc, state.instance) in seen else ""
-            absent = self._see(Word(state.term, Source.RC, state.rc, proven)).absent_until
+            absent = self._weigh(Word(state.term, Source.RC, state.rc, proven)).absent_until
             if not absent and not self.terms.is_led_nowhere(state.term, proven, now, silence):
                 heard.append((proven if self.terms.secured else state.host, state))
         return heard
 
-    async def _divided(self, states: list[RcState]) -> bool:
-        """Whether an RC that is seen obeys a term which is absurd to others: they are told why this one goes above."""
+    async def _has_absurd_term(self, states: list[RcState]) -> bool:
+        """Return True if an RC with a token obeys a term that is absurd to other RCs: those must be asked to go above
+        it."""
         highest = max(states, key=lambda state: state.term, default=None)
         if highest is None or not any(absurd(highest.term, state.term) for state in states):
             return False
         return bool(await self.mesh.living(self.mesh.keys.alive_rc(highest.rc), timeout=self._timeout))
 
     async def _take_over(self) -> bool:
-        """One attempt. Where it finds a higher term promised, another candidate may be about to lead in it: the next
-        attempt goes above, if none does."""
+        """Make one attempt to lead. If RCs have promised a higher term, another candidate may be about to lead in it:
+        the next attempt takes a term above that."""
         keys = self.mesh.keys
         if self.election.sees_leader(self.mesh.now()):
             return False
@@ -329,37 +330,41 @@ class Candidate:
             self._kept.keep(term),
         )
         refusals = [_refusal(reply, term) for reply in rcs]
-        await self._hear_refusals(Source.RC, refusals)
-        await self._hear_refusals(Source.CLIENT, [_refusal(reply, term) for reply in clients])
-        open_requests = self._credible(clients, lambda one: keys.requests(client_of(one.client)))
-        self._hear_seals(one for one, _ in open_requests)
+        await self._weigh_refusals(Source.RC, refusals)
+        await self._weigh_refusals(Source.CLIENT, [_refusal(reply, term) for reply in clients])
+        open_requests = self._credible(clients, lambda answer: keys.requests(client_of(answer.client)))
+        self._weigh_seals(answer for answer, _ in open_requests)
         if self.known > term:
-            self.election.rivalled(self.mesh.now())
+            self.election.outbid(self.mesh.now())
             return False
-        # One of another term does not promise, or is from before it did.
-        answers = [one for one in self._credible(rcs, lambda state: keys.rc_state(state.rc)) if one[0].term == term]
+        # A state of another term is no promise, or was sent before the promise.
+        answers = [
+            answer for answer in self._credible(rcs, lambda state: keys.rc_state(state.rc)) if answer[0].term == term
+        ]
         if not answers and any(refused is not None and disbelieved(term, refused[1]) for refused in refusals):
             log.info("no RC believes term %d while they hear an RCM of another: waiting", term.counter)
             return False
         now = self.mesh.now()
         states = [aged(state, now - arrived) for state, arrived in answers]
-        asking = [one for one, _ in open_requests if one.term in (term, NO_TERM)]
-        kept = [one for one in credible(keepers, keys, now) if self._authority.may_lead(one.host)]
+        asking = [answer for answer, _ in open_requests if answer.term in (term, NO_TERM)]
+        kept = [answer for answer in credible(keepers, keys, now) if self._authority.may_lead(answer.host)]
         return await self._lead(term, states, asking, kept)
 
-    async def _hear_refusals(self, source: Source, refusals: list[tuple[str, Term] | None]) -> None:
-        """RCs or clients obey higher terms. What has no token may be anybody's word."""
+    async def _weigh_refusals(self, source: Source, refusals: list[tuple[str, Term] | None]) -> None:
+        """Judge the higher terms that RCs or clients obey, by their tokens where these matter."""
         keys, hosts = self.mesh.keys, dict[str, str]()
         shown = [(key, term) for key, term in filter(None, refusals) if self.terms.is_news(term, source)]
         if any(self.terms.secured or absurd(term, self.known) for _, term in shown):
             seen = await self.mesh.living(keys.alive_any(), timeout=self._timeout)
-            hosts = {keys.rc_state(one.name): one.host for one in seen if one.role == Role.RC}
-            hosts |= {keys.requests(Sender(one.host, one.name)): one.host for one in seen if one.role == Role.CLIENT}
+            hosts = {keys.rc_state(token.name): token.host for token in seen if token.role == Role.RC}
+            hosts |= {
+                keys.requests(Sender(token.host, token.name)): token.host for token in seen if token.role == Role.CLIENT
+            }
         for key, term in shown:
-            self._see(Word(term, source, key, hosts.get(key, "")))
+            self._weigh(Word(term, source, key, hosts.get(key, "")))
 
-    def _hear_seals(self, answers: Iterable[ClientRequests]) -> None:
-        """Take the terms of places that clients list with a right seal."""
+    def _weigh_seals(self, answers: Iterable[ClientRequests]) -> None:
+        """Judge the terms of the listed places that have a valid seal."""
         places = Places(self.fleet.name, self._parts.places_key, NO_TERM)
         for answer in answers if self.terms.secured else ():
             for request in answer.requests:
@@ -367,11 +372,10 @@ class Candidate:
                 if place is None or place.term <= self.known:
                     continue
                 if places.proves(place, answer.client, request.was or request.id, request.seal):
-                    self._see(Word(place.term, Source.SEAL, answer.client, client_of(answer.client).host))
+                    self._weigh(Word(place.term, Source.SEAL, answer.client, client_of(answer.client).host))
 
     def _credible(self, replies: list[Reply[R]], key_of: Callable[[R], str]) -> list[tuple[R, Ns]]:
-        """The messages of `replies` that name in themselves whom their key names, and when they came; others prove
-        nothing."""
+        """The messages of `replies` whose content names the same sender as their key, each with its arrival."""
         messages = []
         for reply in replies:
             try:
@@ -385,7 +389,7 @@ class Candidate:
         self, term: Term, states: list[RcState], open_requests: list[ClientRequests], kept: list[BookingsKept]
     ) -> bool:
         places = Places(self.fleet.name, self._parts.places_key, term)
-        self.learned.keeper.records.take(record for one in kept for record in one.records)
+        self.learned.keeper.records.take(record for answer in kept for record in answer.records)
         admission = Admission(self._authority, places)
         home_of, record_of = self.inventory.devices.home_of, self.learned.keeper.records.get
         recovered = take_over(states, open_requests, self.mesh.now(), admission, home_of, record_of)
@@ -400,7 +404,7 @@ class Candidate:
             self.mesh,
             self.fleet,
             term,
-            self._see,
+            self._weigh,
             self._failed,
             Parts(
                 self.inventory,
@@ -420,7 +424,7 @@ class Candidate:
         await rcm.enter()
         if self.known > term:
             self._leading.close()
-            self.election.rivalled(self.mesh.now())
+            self.election.outbid(self.mesh.now())
             return False
         self.rcm, self.terms.goes_above = rcm, False
         self.terms.led(term, self.mesh.now())
@@ -445,7 +449,8 @@ class Candidate:
 
 
 def _refusal(reply: Reply[RcState] | Reply[ClientRequests], promise: Term) -> tuple[str, Term] | None:
-    """Who does not promise that term, and which it obeys; None: it promises, or says nothing of a term."""
+    """The key of an RC or client that does not promise this term, and the term that it obeys; None: it promises, or
+    names no term."""
     if reply.message is not None:
         return None if reply.message.term in (promise, NO_TERM) else (reply.key, reply.message.term)
     return None if reply.problem is None or reply.problem.term is None else (reply.key, reply.problem.term)

@@ -1,5 +1,5 @@
-"""What became of holds in one term, for who counts it or tells people: the core's events and effects as beginnings and
-ends of holds. It is worked out once all answers of an instant are sent."""
+"""Translates the core's events and effects in one term to beginnings and ends of holds, for figures and notices to
+people. It runs once all answers of an instant are sent."""
 
 from __future__ import annotations
 
@@ -34,13 +34,13 @@ class Began(NamedTuple):
     rcs: tuple[RcName, ...]
     at: Ns
     waited: Ns | None
-    """Since it was last queued; None: it goes on, from another RCM or client."""
+    """The time since it was last queued; None: it continues from another RCM or client."""
     late: Ns | None
-    """By how much it starts later than its client was told first; None: that was told nothing."""
+    """The delay compared with the first estimate sent to its client; None: no estimate was sent."""
 
 
 class Over(NamedTuple):
-    """That hold is over. `outcome` and `reason` are None where it goes on, under another RCM."""
+    """The end of a hold here. `outcome` and `reason` are None if it continues under another RCM."""
 
     began: Began
     at: Ns
@@ -50,7 +50,7 @@ class Over(NamedTuple):
 
 
 class HoldListener(Protocol):
-    """Is told in the RCM's event loop: it must not block."""
+    """Called in the RCM's event loop: it must not block."""
 
     def on_began(self, began: Began) -> None: ...
 
@@ -62,7 +62,7 @@ class HoldListener(Protocol):
 
 
 class HoldDigest:
-    """Of one term of `core`. Its own faults, and its listeners', end it and nothing else."""
+    """The digest of one term of `core`. Errors in it, or in a listener, end the digest and nothing else."""
 
     def __init__(self, core: Core, listeners: Sequence[HoldListener]) -> None:
         self._core, self._listeners = core, listeners
@@ -76,22 +76,22 @@ class HoldDigest:
         effects: Iterable[Effect],
         estimates: Mapping[ArcId, Ns] = MappingProxyType({}),
     ) -> None:
-        """What happened in one instant, in its order. `foretold`: the starts that clients were notified of first."""
+        """Digest one instant. `estimates`: the first estimated starts that clients were notified of."""
         try:
             self._take(now, events, effects, estimates)
         except Exception:
-            log.exception("holds are neither counted nor told of any more in this term")
+            log.exception("figures and notices of holds failed: disabled for this term")
             self._listeners = ()
 
     def close(self, now: Ns) -> None:
-        """This RCM does not lead any more: what is held goes on."""
+        """This RCM no longer leads: all holds continue elsewhere."""
         effects = [Over(began, now, None, None, requeued=False) for began in self._held.values()]
         self._held.clear()
         try:
             for over in effects:
-                self._tell_over(over)
+                self._notify_over(over)
         except Exception:
-            log.exception("holds that go on were not counted")
+            log.exception("figures and notices failed for holds that continue under the next leader")
 
     def _take(self, now: Ns, events: Iterable[Event], effects: Iterable[Effect], estimates: Mapping[ArcId, Ns]) -> None:
         recovered: list[ArcId] = []
@@ -115,9 +115,9 @@ class HoldDigest:
                     self._begin(arc, now, waited, None if start is None or waited is None else now - start)
                 case HoldEnded(arc=arc, outcome=outcome, reason=reason, requeued=requeued):
                     if (began := self._held.pop(arc, None)) is not None:
-                        self._tell_over(Over(began, now, outcome, reason, requeued))
+                        self._notify_over(Over(began, now, outcome, reason, requeued))
         for arc in recovered:
-            # The core says no word of what goes on as it is.
+            # The core yields no effect for recovered holds that continue unchanged.
             if arc not in self._held and self._core.is_running(arc):
                 self._begin(arc, now)
 
@@ -130,6 +130,6 @@ class HoldDigest:
         for listener in self._listeners:
             listener.on_began(began)
 
-    def _tell_over(self, over: Over) -> None:
+    def _notify_over(self, over: Over) -> None:
         for listener in self._listeners:
             listener.on_over(over)

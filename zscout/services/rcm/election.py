@@ -1,8 +1,8 @@
-"""When a candidate may try to lead. Pure: what is seen goes in, with the time; the next step comes out.
+"""Decides when a candidate may try to lead. Pure: observations go in with their time, the next try comes out.
 
 There is no vote among candidates. A leader leads until it dies or a higher term is seen; only while no leader is seen
-does rank matter: the better candidate tries first, the next waits its turn. Who was deposed waits longer each time, so
-that two that do not see each other do not take turns over RCs that see both."""
+does rank matter: the better candidate tries first, the next waits its turn. A deposed candidate waits longer each time,
+so that two candidates that do not see each other do not alternate over RCs that see both."""
 
 from __future__ import annotations
 
@@ -13,29 +13,29 @@ from typing import NamedTuple
 from zscout.types import SECOND, HostName, Ns, Term
 
 SETTLE = SECOND // 4
-"""From joining the mesh, which takes 0.2 s where nobody answers, until a leader that exists has been seen. One that is
-seen later is found by its RCs, which are asked before anybody leads."""
+"""The time after joining the mesh (0.2 s if no peer answers) by which an existing leader is seen. Before a candidate
+leads it asks the RCs, which know of a leader that it has not seen yet."""
 TURN = SECOND // 4
 """The head start of each better-ranked candidate."""
 RETRY = SECOND // 10
-"""From one attempt that failed to the next. Well below TURN: where RCs see the old leader's end a little late, the next
-in rank would else try at the same moment."""
+"""The pause after a failed attempt. Well below TURN: if RCs see the old leader's end a little late, the next in rank
+does not try at the same moment."""
 CALM = 10 * SECOND
-"""After so long without being deposed, a candidate waits as after the first time."""
+"""A candidate not deposed for this long waits as after its first deposition."""
 ALONE = 2
-"""Silences for which a deposed candidate waits at most that sees nobody else: its own RCs wait as well."""
+"""Silences that a deposed candidate waits at most while no other host answers: its own RCs wait as well."""
 MAX_DOUBLINGS = 5
 WAITS: Ns = 4 * SECOND
-"""A candidate waits so long for a leader that only others see until it reopens its session. A leader that lives shows
-itself within a silence after that. RCs see one that died for a shorter time."""
+"""The time that a candidate waits for a leader seen only by others, before it reopens its session. It sees a living
+leader within a silence after that. RCs see a dead leader for a shorter time."""
 BACKOFF, MAX_BACKOFF = 1.0, 30.0
-"""Seconds until a candidate that failed becomes one again: doubled each time, at most."""
+"""Seconds until a failed candidate becomes one again: the first pause, doubled each time, and the longest."""
 BACKOFF_RESET_AFTER: Ns = 60 * SECOND
-"""After a candidacy at least this long the next failure begins with BACKOFF anew."""
+"""After a candidacy of at least this length the next pause is BACKOFF again."""
 
 
 class Setbacks:
-    """Candidacies that failed one after the other."""
+    """Counts consecutive failures of a candidacy."""
 
     def __init__(self) -> None:
         self._began: Ns = 0
@@ -51,12 +51,12 @@ class Setbacks:
 
 
 def views(sights: Iterable[tuple[HostName, bool]], me: HostName) -> tuple[dict[HostName, bool], bool]:
-    """For each other host, and for this one: whether most of its RCs see a leader. RCs of one host share its view of
+    """For each other host, and for this one: True if most of its RCs see a leader. RCs of one host share its view of
     the mesh. RCs of unknown hosts ("") count as one host, and only if no other host answers."""
-    said = defaultdict[HostName, list[bool]](list)
+    by_host = defaultdict[HostName, list[bool]](list)
     for host, sees in sights:
-        said[host].append(sees)
-    found = {host: sum(seen) * 2 > len(seen) for host, seen in said.items()}
+        by_host[host].append(sees)
+    found = {host: sum(seen) * 2 > len(seen) for host, seen in by_host.items()}
     own = found.pop(me, False)
     if len(found) > 1:
         found.pop("", None)
@@ -64,7 +64,7 @@ def views(sights: Iterable[tuple[HostName, bool]], me: HostName) -> tuple[dict[H
 
 
 class _Lone(NamedTuple):
-    """The only other host that answers, and since when it has shown a leader."""
+    """The only other host that answers, and the time since which it has shown a leader."""
 
     host: HostName
     since: Ns
@@ -79,28 +79,28 @@ class Election:
         self.silence = silence
         self._candidates = Counter[str]()
         self._leaders: dict[str, Ns] = {}
-        """When each leader that has a token last published (or its token was seen first)."""
+        """By instance: the time at which a leader with a token last published (or its token appeared)."""
         self._since = now + SETTLE
         self._not_before: Ns = 0
         self._heard: Ns | None = None
-        """When a leader that counts was seen or heard last."""
+        """The time of the last token or publication of a credible leader."""
         self._deposed: Ns | None = None
         self._depositions = 0
         self._led = True
-        """Whether somebody may lead in the term that deposed it."""
+        """True unless the term that deposed this candidate is known to have no leader yet."""
         self._yields_until: Ns = 0
         self._lost: dict[str, Ns] = {}
-        """Hosts whose candidates were seen to go, and when."""
+        """Hosts whose candidates disappeared, and when."""
         self._returned: Ns | None = None
-        """When one of them came back last."""
-        self._stood_still: Ns | None = None
+        """The time at which one of those hosts last returned."""
+        self._stalled: Ns | None = None
         self._alone_since: Ns | None = None
         self._lone: _Lone | None = None
         self.led_by: HostName | None = None
-        """The host of the leader that was seen last."""
+        """The host of the last leader that was seen."""
 
     def candidate(self, host: str, *, alive: bool, now: Ns) -> None:
-        """A candidate's token came or went."""
+        """A candidate's token appeared or disappeared."""
         if alive:
             if self._lost.pop(host, None) is not None:
                 self._returned = now
@@ -110,13 +110,13 @@ class Election:
         self._candidates = +self._candidates
 
     def leader(self, instance: str, host: HostName, *, alive: bool, now: Ns) -> None:
-        """A leader's token came or went."""
+        """A leader's token appeared or disappeared."""
         if alive:
             self.led_by = host
             self._leaders[instance] = self._heard = now
             self._alone_since = None
         elif self._leaders.pop(instance, None) is not None and not self._leaders:
-            # Who has seen a leader is on the mesh: there is nothing to settle any more.
+            # A candidate that has seen a leader has joined the mesh, and need not wait for SETTLE.
             self._since = now
 
     def published(self, term: Term, now: Ns) -> None:
@@ -126,20 +126,20 @@ class Election:
             self._leaders[term.rcm] = now
 
     def sees_leader(self, now: Ns) -> bool:
-        """A leader counts while its token lives and it publishes: one whose program hangs keeps its token."""
+        """Return True if a leader has a token and has published within a silence: a hanging program keeps its token."""
         return any(now - at < self.silence for at in self._leaders.values())
 
     def failed(self, now: Ns) -> None:
-        """An attempt did not lead to the lead."""
+        """An attempt to lead failed."""
         self._not_before = max(self._not_before, now + RETRY)
 
-    def rivalled(self, now: Ns) -> None:
-        """A higher term than was known is promised: another candidate leads in it within a turn, or has failed."""
+    def outbid(self, now: Ns) -> None:
+        """RCs promised a higher term than was known: another candidate leads in it within a turn, or has failed."""
         self._not_before = now + TURN
 
     def deposed(self, now: Ns, jitter: float, *, led: bool = True) -> None:
-        """A higher term ended the own one. `jitter` is about 1. Not `led`: it was promised, and nobody is known to lead
-        in it; who does shows himself within a turn, or RCs see him."""
+        """A higher term ended the own term. `jitter` is about 1. Unless `led`, the higher term was only promised: a
+        leader of it would show itself, or be seen by RCs, within a turn."""
         self._led = led
         if not led:
             self._heard, self._not_before = None, now + TURN
@@ -148,13 +148,14 @@ class Election:
         self._yields_until = now + round((self.silence << min(self._depositions, MAX_DOUBLINGS)) * jitter)
         self._deposed, self._depositions = now, self._depositions + 1
 
-    def stood_still(self, now: Ns) -> None:
-        """This process has just gone on: what it sees go may have missed it, and not the other way round."""
-        self._stood_still = now
+    def stalled(self, now: Ns) -> None:
+        """This process stalled until now: hosts that seem to disappear may have lost sight of this host instead."""
+        self._stalled = now
 
     def waited_in_vain(self, others: Mapping[HostName, bool], now: Ns) -> bool:
         """Return True if the only other host that answers has shown a leader for so long that this candidate would have
-        seen it. The time begins again when this candidate sees or hears a leader; no answer at all does not stop it."""
+        seen it. The time begins again when this candidate sees a leader's token or publication, and continues while no
+        other host answers."""
         if not others:
             return False
         if list(others.values()) != [True]:
@@ -169,9 +170,9 @@ class Election:
     def must_wait(self, others: Mapping[HostName, bool], own: bool, now: Ns) -> bool:
         """Return True if RCs show a leader: most other hosts do (`views`), or this host (`own`).
 
-        This host's RCs count only if no other host answers: they see what it sees. If this host may be cut off,
-        the candidate waits for one more silence. While links return, one host that shows a leader is enough: the
-        leader's own link may be the next."""
+        This host's RCs count only if no other host answers, as they see the same as this candidate. If this host may be
+        cut off, the candidate waits one more silence. While links return, one host that shows a leader is enough, as
+        the link to that leader may return next."""
         sights = others.values()
         if others:
             self._alone_since = None
@@ -182,7 +183,7 @@ class Election:
             and self._deposed is not None
             and now < min(self._yields_until, self._deposed + ALONE * self.silence)
         ):
-            # The RCM that deposed this candidate continues, though nobody who shows it is seen: they would take turns.
+            # The RCM that deposed this candidate may lead on unseen hosts: don't alternate with it.
             return True
         if not own and not self._was_away(now) and self._alone_since is None:
             return False
@@ -190,26 +191,26 @@ class Election:
         return now - self._alone_since < self.silence
 
     def _was_away(self, now: Ns) -> bool:
-        """Whether it may be this host that is cut off, or was until a silence ago."""
+        """Return True if this host itself may be cut off, or may have been until a silence ago."""
         missed = [at for host, at in self._lost.items() if host not in (self.led_by, self.host)]
-        if self._stood_still is not None:
-            missed.append(self._stood_still)
+        if self._stalled is not None:
+            missed.append(self._stalled)
         return any(now - at <= self.silence for at in missed)
 
     def links_return(self, now: Ns) -> bool:
-        """Whether links of this host may be coming back, one after the other."""
+        """Return True if links of this host may be returning, one after the other."""
         return self._is_back(now) or self._was_away(now)
 
     def _is_back(self, now: Ns) -> bool:
-        """Return True if a host whose candidate had gone came back within a silence."""
+        """Return True if a host whose candidate had disappeared returned within the last silence."""
         return self._returned is not None and now - self._returned <= self.silence
 
     def heard_within(self, span: Ns, now: Ns) -> bool:
-        """Whether a leader that counts was seen or heard so lately."""
+        """Return True if a credible leader was seen or published within `span`."""
         return self._heard is not None and now - self._heard < span
 
     def next_try(self, now: Ns) -> Ns | None:
-        """When to try to lead: now or earlier means at once, None not while things stay as they are."""
+        """The time at which to try to lead; `now` or earlier: at once; None: not before something changes."""
         if self.ranking and self.host not in self.ranking:
             return None
         if self.sees_leader(now):

@@ -1,7 +1,7 @@
 """Each candidate's knowledge of the devices of its fleet, for the time when it leads.
 
-It follows tokens and states of RCs, asks the leader for what went before it came, and keeps it all over its own
-restarts in a file of the node's state folder."""
+It follows tokens and states of RCs, asks the leader for the devices seen before it joined, and stores them in a file
+of the node's state folder."""
 
 from __future__ import annotations
 
@@ -31,23 +31,23 @@ FILE: Final = "devices.json"
 ASK_TIMEOUT: Final = 2.0
 TRIES: Final = 3
 SAVE_AFTER: Final = 5.0
-"""Seconds that changes are gathered before they are on disk."""
+"""Seconds for which changes are gathered before they are written."""
 SAVE_EVERY: Final = 300.0
-"""Seconds after which it is written again: devices that are there were seen until then."""
+"""Seconds between writes without changes: the file's date is when present devices were last seen."""
 
 
 class _DeviceFile(msgspec.Struct):
-    """What is kept on disk. `written` is in seconds since 1970: a host's own clock ends with it."""
+    """The file. `written` is in seconds since 1970, as a host's monotonic clock ends when it restarts."""
 
     written: Annotated[float, msgspec.Meta(ge=0, le=1e11)]
     homes: list[SeenHome] = []
 
 
 class Inventory:
-    """Follows devices while its candidate stands, and keeps them from one candidacy to the next."""
+    """Follows devices during a candidacy, and keeps them for the next."""
 
     def __init__(self, mesh: Mesh, fleet: Fleet, folder: Path | None = None) -> None:
-        """`folder`: where it is kept over restarts, if anywhere."""
+        """`folder`: for its file; None: nothing is stored."""
         self.mesh = mesh
         self.devices = ExpectedDevices(fleet.devices)
         self._file = None if folder is None else folder / FILE
@@ -57,7 +57,7 @@ class Inventory:
     def start(self, supervisor: Supervisor) -> None:
         keys, mesh = self.mesh.keys, self.mesh
         self._supervisor = supervisor
-        # Tokens that live are told of anew.
+        # Existing tokens are reported again.
         self.devices.forget_tokens(mesh.now())
         for declared in (
             mesh.subscribe(keys.rc_state_any, RcState, supervisor.guard(self._on_state)),
@@ -86,7 +86,7 @@ class Inventory:
             self.devices.report(state)
 
     def _on_leader(self, token: Token, alive: bool) -> None:
-        """Who comes late asks for what went before."""
+        """Ask another leader for the devices that were seen before this host joined."""
         if alive and token.host != self.mesh.me.host:
             self._supervisor.spawn(self._catch_up())
 
@@ -110,7 +110,7 @@ class Inventory:
         except (BadInput, Malformed) as error:
             log.warning("%s can't be read, and is not used: %s", self._file, error)
             return
-        # A clock that was set back makes nothing younger than it was.
+        # If the clock was set back, no age decreases.
         since = max(0.0, time.time() - kept.written)
         homes = (structs.replace(home, ago=home.ago + since) for home in kept.homes)
         self.devices.remember(homes, self.mesh.now())

@@ -1,4 +1,4 @@
-"""What a candidate learns from the publications of leaders, to go on from when it leads."""
+"""A candidate's knowledge from the publications of leaders, for the time when it leads itself."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ class Learned:
     def __init__(self, keeper: BookingKeeper, runtimes: RuntimeObserver, journal: Journal | None) -> None:
         self.keeper, self.runtimes, self._journal = keeper, runtimes, journal
         self._charged: tuple[Mapping[str, float], Ns] = {}, 0
-        """What groups had, by the last publication of it, and when that came."""
+        """The last published usage per group, and its arrival."""
         self.patience: Ns | None = None
-        """The last that was published."""
+        """The last published patience."""
 
     def hear(self, now: Ns, grants: Grants) -> None:
-        """A publication, of a term that is believed."""
+        """Take in a publication of a believed term."""
         self.keeper.hear(grants)
         self.runtimes.hear(now, grants)
         if grants.charged:
@@ -32,6 +32,6 @@ class Learned:
             self._journal.hear(grants)
 
     def charged(self, now: Ns, half_life: Ns) -> dict[str, float]:
-        """What each group still counts as having had (`fair_shares.py`)."""
+        """Usage per group, decayed since its publication (`fair_shares.py`)."""
         charged, at = self._charged
-        return {group: decayed(had, now - at, half_life) for group, had in charged.items()}
+        return {group: decayed(usage, now - at, half_life) for group, usage in charged.items()}

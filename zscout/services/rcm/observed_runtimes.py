@@ -1,5 +1,5 @@
-"""Learns how long holds last from the leader's publications, which every candidate receives, and from the journal: a
-new leader knows as much as the last."""
+"""Learns the durations of holds from the leader's publications, which every candidate receives, and from the journal:
+a new leader knows as much as the last."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from zscout.scheduling.runtimes import RuntimeEstimator, Wish
 from zscout.types import SECOND, Grant, Ns
 
 MAX_OPEN: Final = 20_000
-"""Holds that are followed at one time: of more, those that began last."""
+"""Holds that are followed at one time: the latest ones."""
 
 
 class _Begun(NamedTuple):
@@ -28,7 +28,7 @@ class RuntimeObserver:
         self._open: OrderedDict[Grant, _Begun] = OrderedDict()
 
     def hear(self, now: Ns, grants: Grants) -> None:
-        """A publication, of a term that is believed; `now` by any clock that goes on."""
+        """Take in a publication of a believed term; `now` by any monotonic clock."""
         for holders in grants.rcs.values():
             for holder in holders:
                 if holder.grant not in self._open:
@@ -39,7 +39,7 @@ class RuntimeObserver:
                 self._end(begun.wish, now - begun.at, revoked.outcome, revoked.why)
 
     def recall(self, holds: Iterable[PastHold]) -> None:
-        """What a journal knows, the oldest first."""
+        """Learn from the holds in a journal, given with the oldest first."""
         for hold in holds:
             if hold.ended is not None and hold.min_runtime is not None and not hold.late and hold.rcs:
                 asked = round(hold.min_runtime * SECOND)
@@ -56,7 +56,8 @@ class RuntimeObserver:
         patterns = {rc: need for need, rc in holder.bound.items()}
         needs = [patterns.get(rc, rc) for rc in holder.rcs]
         wish = _wish(holder.arc, holder.who, needs, asked)
-        # One that is heard of late, or goes on under another grant, began as long ago as it has used up of its time.
+        # A hold that is seen late, or that continues under a new grant, began earlier: by the part of its minimum
+        # runtime that is used up.
         self._open[holder.grant] = _Begun(wish, now - max(0, asked - round(holder.remaining * SECOND)))
         if len(self._open) > MAX_OPEN:
             self._open.popitem(last=False)
@@ -68,8 +69,8 @@ class RuntimeObserver:
         expired = why is not None and why.code == ReasonCode.EXPIRED
         given_back = why is not None and why.code == ReasonCode.RELEASED and why.own
         if expired:
-            lasted = wish.runtime  # all that was asked for: what is more is the way of the news
-        # Whole: it had all that its program wanted, or asked for.
+            lasted = wish.runtime  # exactly: the rest is the latency of publications
+        # Whole: the program had all the time that it wanted, or had requested.
         self.estimator.observe(wish, lasted, whole=expired or given_back)
 
 

@@ -1,5 +1,5 @@
-"""The leading RCM on the mesh: what the mesh brings becomes stimuli, those of one burst one step of the leader
-(`zscout/rcm/leader.py`), and its Outbox is carried out in its order.
+"""The leading RCM on the mesh: turns messages into stimuli, gives each burst of them to the leader as one step
+(`zscout/rcm/leader.py`), and carries out its Outbox in order.
 
 Nothing is decided here."""
 
@@ -49,31 +49,31 @@ LATE_VOTE = 2.0
 
 
 class Parts(NamedTuple):
-    """What a candidate gives its RCM."""
+    """Parts of a candidate that its RCM uses."""
 
     inventory: Inventory | None = None
     authority: Authority | None = None
     places: Places | None = None
-    """What it has recovered, as `kept`."""
     listeners: Sequence[HoldListener] = ()
-    """Get to know of holds."""
+    """Notified of holds."""
     tally: Tally | None = None
-    """Counts how operations end."""
+    """Counts the results of operations."""
     keeper: BookingKeeper | None = None
     kept: Sequence[messages.BookingsKept] = ()
+    """The answers of other keepers to the takeover."""
     runtimes: RuntimeEstimator | None = None
-    """Forecasts go by them."""
+    """Observed durations of holds, for forecasts."""
     on_disbelieved: Callable[[RcName, Term], object] = lambda *_: None
-    """Called when no RC has joined, and one obeys an RCM of so low a term that this one is none to it."""
+    """Called when no RC has joined, and an RC obeys a term so low that it considers this term absurd."""
     on_danger: Callable[[BookedDanger], object] = lambda _: None
-    """Called with dangers of bookings that last."""
+    """Called with dangers of bookings that persist."""
     on_drained: Callable[[frozenset[HostName]], object] = lambda _: None
     """Called with the hosts in maintenance when they change."""
 
 
 class Rcm:
-    """One term of one RCM, from taking the lead to giving it up. When any of its work fails, `on_failure` is
-    called with the error, once: the term is to be ended then."""
+    """One term of an RCM, from its beginning to its end. When any of its tasks fails, `on_failure` is called with the
+    error, once: the caller must then end the term."""
 
     def __init__(
         self,
@@ -105,10 +105,10 @@ class Rcm:
         self._stall = StallWatch(mesh.now)
         self._stalled = steps.Stalled(0, 0, fresh=False)
         self._coming: list[steps.Stimulus] = []
-        """Of the present burst."""
+        """The stimuli of the present burst."""
         self._running = False
         self._open: dict[Ticket, IncomingQuery[messages.Operation]] = {}
-        """Operations that are not answered yet."""
+        """Operations without an answer yet."""
         self._tickets = count(1)
         self._declared: list[Declaration] = []
         self._alarm = Alarm(mesh.now, self.supervisor, self._on_alarm)
@@ -127,7 +127,7 @@ class Rcm:
 
     @property
     def seq(self) -> int:
-        """The last number that was published."""
+        """The number of the last publication."""
         return self.leader.seq
 
     @property
@@ -137,18 +137,18 @@ class Rcm:
     # Beginning and end
 
     async def enter(self) -> None:
-        """Has the core know of dates, in parts between which others run, before it begins to lead."""
+        """Give the core all dates before the term begins, in parts between which other tasks run."""
         for part in self.bookings.dates.parts():
             self.core.handle(self.mesh.now(), part)
             await asyncio.sleep(0)
 
     def start(self, recovered: RecoveredState) -> None:
-        """Begins to lead. Everything that is declared here is declared by the leader only."""
+        """Begin to lead. Only a leader makes the declarations that are made here."""
         keys, mesh, guard = self.mesh.keys, self.mesh, self.supervisor.guard
         if self._parts.inventory is None:
             self.inventory.start(self.supervisor)
         self._stall.start()
-        self._now_take(steps.Lead(recovered))
+        self._take_now(steps.Lead(recovered))
         self._declared = [
             mesh.serve(
                 keys.schedule_any,
@@ -171,7 +171,7 @@ class Rcm:
         self.supervisor.spawn(self._send_heartbeats())
 
     def stop(self) -> None:
-        """Stops leading. Nothing is revoked: holds and requests stay for the next RCM."""
+        """Stop leading. Nothing is revoked: holds and requests remain for the next RCM."""
         if self._digest is not None:
             self._digest.close(self.mesh.now())
         for declared in reversed(self._declared):
@@ -189,32 +189,33 @@ class Rcm:
         self._grants.close()
 
     def on_reload(self) -> None:
-        self._now_take(steps.Reloaded())
+        self._take_now(steps.Reloaded())
 
     # In
 
-    def _look(self) -> None:
-        """Before the leader judges by tokens and answers, it is to know of a stall of this process."""
+    def _note_stall(self) -> None:
+        """Report a new stall of this process, before the leader judges tokens and answers."""
         stalled = steps.Stalled(self._stall.length, self._stall.ended, self._stall.fresh())
         if stalled != self._stalled:
             self._stalled = stalled
             self._coming.append(stalled)
 
     def _take(self, stimulus: steps.Stimulus) -> None:
-        """Those of one burst are taken together."""
+        """Add a stimulus to the step of the present burst."""
         first = not self._coming
         if not isinstance(stimulus, steps.OperationAsked):
-            self._look()
+            self._note_stall()
         self._coming.append(stimulus)
         if first:
             self.mesh.after_burst(self._run)
 
-    def _now_take(self, stimulus: steps.Stimulus) -> None:
+    def _take_now(self, stimulus: steps.Stimulus) -> None:
         self._coming.append(stimulus)
         self._run()
 
     def _concerns(self, query: IncomingQuery[messages.Operation]) -> tuple[Lane, str]:
-        """Dry runs and slots are questions; an operation on another host's request waits behind that host's surplus."""
+        """The lane and host of an operation. Dry runs and slots are questions; an operation on another host's request
+        waits behind the surplus of that host."""
         operation, host = query.message, self.mesh.keys.sender_of(query.key).host
         if isinstance(operation, (messages.Foresee, messages.FindSlots)):
             return Lane.QUESTION, host
@@ -237,15 +238,15 @@ class Rcm:
         self._take(steps.TokenSeen(token, alive))
 
     def _on_alarm(self) -> None:
-        self._look()
+        self._note_stall()
         self._run()
 
     # A step
 
     def _run(self) -> None:
-        """Steps, until nothing is left to be decided."""
+        """Run steps until no stimuli are left."""
         if self._running:
-            return  # what came is taken once this Outbox is carried out
+            return  # the running call takes new stimuli once this Outbox is carried out
         self._running = True
         try:
             more = self.supervisor.active
@@ -261,7 +262,7 @@ class Rcm:
             self._running = False
 
     def _carry_out(self, out: steps.Outbox) -> bool:
-        """In the order of the fields. Return False if this leader stepped down."""
+        """Carry out the fields of an Outbox in their order. Return False if this leader stepped down."""
         mesh, supervisor = self.mesh, self.supervisor
         self._answer(out.at_once)
         for word, token in out.higher:
@@ -287,7 +288,7 @@ class Rcm:
             supervisor.spawn(self._ask(question))
         for sign, so in out.suspicions:
             mesh.suspicions.suspect(sign, so=so)
-        self.sharing.tell(out.changed)
+        self.sharing.share_soon(out.changed)
         for keep in out.keep:
             supervisor.spawn(self._keep(keep))
         for danger in out.dangers:
@@ -304,7 +305,7 @@ class Rcm:
         for rc, host in out.duplicates:
             log.warning("duplicate device %s at %s; another host's is used", rc, host)
         if self._digest is not None and (out.effects or out.events):
-            # All who wait for an answer have it by now.
+            # All answers of the instant are sent by now.
             self._digest.take(mesh.now(), out.events, out.effects, self.leader.registry.first_estimates)
         self._trace(out.over)
         self._alarm.set(out.wake)
@@ -352,7 +353,7 @@ class Rcm:
         self._take(steps.Kept(keep, why))
 
     async def _send_heartbeats(self) -> None:
-        """Repeats the last number whenever nothing was published for a while."""
+        """Publish a heartbeat whenever nothing was published for its period."""
         while True:
             due = self.leader.published + self.fleet.timing.heartbeat - self.mesh.now()
             if due > 0:
@@ -365,9 +366,9 @@ class Rcm:
     def _propose(self, proposed: steps.Proposed) -> None:
         rc, proposal = proposed
         vote_timeout = self.fleet.timing.vote_timeout / SECOND
-        # Overdue once; an answer that comes before the query ends still counts.
+        # The vote is overdue before the query ends, and still counts if it arrives before that.
         over = steps.CoreEvents([VoteOverdue(proposal.proposal)])
-        overdue = self.supervisor.call_later(vote_timeout, self._now_take, over)
+        overdue = self.supervisor.call_later(vote_timeout, self._take_now, over)
         voted = partial(self.supervisor.guard(self._on_ballot), rc, proposal.proposal, overdue)
         late = max(LATE_VOTE, 2 * vote_timeout)
         try:

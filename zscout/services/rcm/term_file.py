@@ -19,7 +19,7 @@ log = logging.getLogger(__name__)
 
 FILE: Final = "term.json"
 KEPT_WITHIN: Final = 1.0
-"""Seconds that a candidate waits for its disk before it leads."""
+"""Seconds for which a candidate waits for its disk before it leads."""
 MAX_BYTES: Final = 4_096
 
 
@@ -35,13 +35,13 @@ class _TermFile(msgspec.Struct):
 
 
 class TermFile:
-    """One fleet's, in `folder`."""
+    """The file of one fleet, in `folder`."""
 
     def __init__(self, folder: Path, fleet: str) -> None:
         self._path, self._fleet = folder / FILE, fleet
 
     def read(self) -> Term:
-        """The term; NO_TERM, and a line in the log, where the file is of no use."""
+        """The stored term; NO_TERM, and a warning in the log, if the file is invalid."""
         if not self._path.exists():
             return NO_TERM
         try:
@@ -59,7 +59,7 @@ class TermFile:
 
 
 class KeptTerm:
-    """Keeps the highest of `terms` on `disk`, from which it was read; without a disk it keeps nothing."""
+    """Stores the highest of `terms` on `disk`, from which it was read; without a disk it does nothing."""
 
     def __init__(self, disk: TermDisk | None, terms: Terms) -> None:
         self._disk, self._terms, self._saved = disk, terms, terms.highest
@@ -67,11 +67,11 @@ class KeptTerm:
 
     @property
     def is_due(self) -> bool:
-        """Return True if a higher term is to be kept: one that is being kept is followed by the highest."""
+        """Return True if `keep` must be called for a higher term: a running call stores later terms as well."""
         return self._disk is not None and not self._lock.locked()
 
     async def keep(self, tried: Term = NO_TERM) -> None:
-        """Return once the highest term, `tried` included, is on disk, or can't be."""
+        """Store the highest term, `tried` included. Return once it is on disk, or writing failed."""
         if self._disk is None:
             return
         async with self._lock:
