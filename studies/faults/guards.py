@@ -221,7 +221,7 @@ NEVER: Final = property(lambda _: False, _nothing)
 
 
 async def _keep_later(self: BookingSharing, record: BookingRecord) -> str:
-    self.tell([record])
+    self.share_soon([record])
     return ""
 
 

@@ -79,7 +79,7 @@ class NoBookings:
     def note(self, *_: Any, **__: Any) -> steps.Outbox:
         return steps.Outbox()
 
-    operation = again = kept = shared = set_clock = tick = note
+    operation = retry = kept = shared = set_clock = tick = note
 
     def take_up(self, ask: Ask, _sender: Any) -> str:
         return ask.booking

@@ -307,7 +307,7 @@ class BookedDates:
             start, status = self.local(date.start), None if arc is None else self._core.arc(arc)
             end, lapses = start + booking.runtime, start + booking.lapses - booking.start
             if date.record.lasting and booking.start <= now:
-                self._begin_again(date.record)
+                self._restart(date.record)
                 continue
             if booking.start > now and (lapses if status is None else end) <= now:
                 skipped.setdefault(date.record.id, []).append(date)

@@ -135,7 +135,7 @@ class Bookings:
             before = len(self.handler.undecided)
             self.handler.operation(ticket, sender, operation)
             if len(self.handler.undecided) > before:
-                self._deadlines.set(self.handler.undecided[-1].until + SLACK, (_Due.TRY, None))
+                self._deadlines.set(self.handler.undecided[-1].until + SLACK, (_Due.RETRY, None))
         except Refused as refused:
             self.dates.out.answers.append((ticket, refused.problem))
         except BadName as error:
@@ -152,7 +152,7 @@ class Bookings:
 
     def shared(self) -> Outbox:
         """Keepers sent records that were unknown here."""
-        self._once(_Due.NEWS, 0)
+        self._once(_Due.RECONCILE, 0)
         return self._out()
 
     def set_clock(self, read: ClocksRead) -> Outbox:
@@ -174,7 +174,7 @@ class Bookings:
     def note(self, events: Collection[Event], effects: Iterable[Effect]) -> Outbox:
         """Take over the events and effects of an instant. Their consequences belong to later instants."""
         if self.dates.note(effects, settled=self.settled):
-            self._once(_Due.NEWS, 0)
+            self._once(_Due.RECONCILE, 0)
         kinds = {*map(type, events), *map(type, effects)}
         if kinds & {BookingThreatened, BookingConflict}:
             self._report_later()
