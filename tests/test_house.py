@@ -36,6 +36,7 @@ PLAIN = [
     *("zscout/components", "zscout/config", "zscout/placement", "zscout/simulation", "zscout/testing"),
     *("zscout/mesh", "zscout/messages", "zscout/services/bookings", "zscout/services/node"),
     *("zscout/services/journal", "zscout/services/metrics", "zscout/services/notify", "zscout/services/placement"),
+    "zscout/services/recorder",
     "zscout/services/plain_http.py",
     *("benchmarks", "zscout/__init__.py", "zscout/node.py"),
     *("zscout/keyexpr.py", "zscout/logs.py", "zscout/ports.py", "zscout/streams.py", "zscout/terminal.py"),

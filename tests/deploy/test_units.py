@@ -153,7 +153,7 @@ def test_a_node_does_all_that_it_does_as_its_unit_has_it(machine: Machine, lab: 
             assert started.returncode == 0, started.stderr
 
     asyncio.run(story())
-    machine.until_logged("records to /var/lib/zscout/runs/")
+    machine.until_logged("recording to /var/lib/zscout/runs/")
     assert machine.show("zscout-node", "NRestarts", "ActiveState") == {"NRestarts": "0", "ActiveState": "active"}
     assert machine.path("/var/lib/zscout/safe").exists()
 

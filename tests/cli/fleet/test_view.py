@@ -188,7 +188,7 @@ def test_a_live_view_serves_the_fleet_and_leaves_a_complete_recording(tmp_path: 
                 await asyncio.to_thread(until, lambda: shown()[-1:] == [f"survey{PERSON}"], "the hold is not shown")
                 await client.end(arc)
                 await asyncio.to_thread(until, lambda: shown()[-2:] == [f"survey{PERSON}", ""], "its end is not shown")
-                await asyncio.to_thread(until, has_past, "nothing is shown of the past")
+                await asyncio.to_thread(until, has_past, "the past is not shown")
                 children = descendants(process)
                 assert len(children) == 2
                 process.send_signal(signal.SIGINT)

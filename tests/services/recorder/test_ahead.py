@@ -21,7 +21,7 @@ from zscout.messages import BookedDate, BookingsTold, BookingView, Unbook
 from zscout.services.recorder.ahead import LEFT, MARGIN, MAX_BARS, Bar, ChartLayer, rows_of
 from zscout.services.recorder.ahead import chart as chart_of_rows
 from zscout.services.recorder.blueprint import AHEAD, CHART_HEAD, CHART_WIDTH, MAX_CHART_ROWS, Ahead, chart_row
-from zscout.services.recorder.bookings import AGAIN, MAX_TOLD, STALE
+from zscout.services.recorder.bookings import AGAIN, MAX_EVENTS, STALE
 from zscout.services.recorder.colours import ALERT, FAILED, MAINTENANCE, PALETTE
 from zscout.services.recorder.timeline import Timeline
 
@@ -166,7 +166,7 @@ def test_what_changes_is_said_once_and_what_stood_before_is_not(path: Path) -> N
     survey = booked("survey", "robot/a", "radio/rf0")
     danger = [{"state": "open", "danger": "robot/* is gone", "bound": {"robot/*": "robot/b"}}, {"state": "open"}]
     with Timeline("lab", path=path) as timeline:
-        news = timeline.bookings.told
+        news = timeline.bookings.take
         news(0, tells(survey))
         news(5, tells(survey, after=5))
         film = booked("film", "robot/*", every=1, dates=danger)
@@ -191,7 +191,7 @@ def test_what_changes_is_said_once_and_what_stood_before_is_not(path: Path) -> N
         # What was taken up is over: its ARC is spoken of.
         "booking film of ws1, Sat 16 Jan, 09:00 to 10:00 UTC, is given up",
         "maintenance mend of ws1 is given up",
-        "booking film of ws1 has lapsed: nobody took it up",
+        "booking film of ws1 has lapsed: it was not taken up",
     ]
 
 
@@ -199,14 +199,14 @@ def test_what_changes_is_said_once_and_what_stood_before_is_not(path: Path) -> N
 def test_conflicts_and_danger_are_said_though_they_stood_before(path: Path) -> None:
     with Timeline("lab", path=path) as timeline:
         stuck = booked("stuck", "robot/a", dates=[{"state": "conflict", "danger": "crew of ws2 stands"}])
-        timeline.bookings.told(0, tells(booked("fine", "robot/b"), stuck))
+        timeline.bookings.take(0, tells(booked("fine", "robot/b"), stuck))
     assert events(path) == ["booking stuck of ws1, Fri 15 Jan, 09:00 to 10:00 UTC, can't be: crew of ws2 stands"]
 
 
 def test_a_danger_that_is_over_is_said(path: Path) -> None:
     with Timeline("lab", path=path) as timeline:
         for at, danger in enumerate(("robot/a is gone", "robot/a is gone", "", "")):
-            timeline.bookings.told(at, tells(booked("fine", "robot/a", dates=[{"state": "open", "danger": danger}])))
+            timeline.bookings.take(at, tells(booked("fine", "robot/a", dates=[{"state": "open", "danger": danger}])))
     assert events(path) == [
         "booking fine of ws1 may not start Fri 15 Jan, 09:00 to 10:00 UTC: robot/a is gone",
         "booking fine of ws1, Fri 15 Jan, 09:00 to 10:00 UTC, stands again",
@@ -215,10 +215,10 @@ def test_a_danger_that_is_over_is_said(path: Path) -> None:
 
 def test_a_flood_of_bookings_is_summed_up(path: Path) -> None:
     with Timeline("lab", path=path) as timeline:
-        timeline.bookings.told(0, tells())
-        timeline.bookings.told(5, tells(*(booked(f"b{number}", "robot/a") for number in range(1_000))))
-    assert len(events(path)) == MAX_TOLD + 1
-    assert events(path)[-1] == f"and {1_000 - MAX_TOLD} more changes of bookings"
+        timeline.bookings.take(0, tells())
+        timeline.bookings.take(5, tells(*(booked(f"b{number}", "robot/a") for number in range(1_000))))
+    assert len(events(path)) == MAX_EVENTS + 1
+    assert events(path)[-1] == f"and {1_000 - MAX_EVENTS} more changes of bookings"
 
 
 def drawn(path: Path, layer: str = "dates", column: str = "Boxes2D:labels") -> list[tuple[float, list[str]]]:
@@ -229,7 +229,7 @@ def test_outlines_have_the_colour_of_what_they_are_and_go_on_with_time(path: Pat
     conflict, danger = {"state": "conflict"}, {"state": "open", "danger": "robot/d is gone"}
     with Timeline("lab", path=path) as timeline:
         timeline.holders(0, "robot/z", [])
-        timeline.bookings.told(
+        timeline.bookings.take(
             0,
             tells(
                 booked("a", "robot/a"),

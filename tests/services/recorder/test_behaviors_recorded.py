@@ -39,9 +39,9 @@ def test_a_sender_s_last_word_comes_through_whatever_it_says(path: Path) -> None
     assert {lane[-1][1][0] for lane in flood} == {f"search · {number}" for number in (997, 998, 999)}
     kept = sum(len(lane) for lane in flood)
     assert kept <= 20 + RATE + 3
-    (told_of,) = (text for text in events(path) if "say too much" in text)
-    assert told_of.startswith("behaviors of bad/one say too much: ")
-    assert int(told_of.split(": ")[1].split()[0]) == 1000 - kept
+    (told_of,) = (text for text in events(path) if "too many reports of behaviors" in text)
+    assert told_of.startswith("too many reports of behaviors from bad/one: dropped ")
+    assert int(told_of.split()[-1]) == 1000 - kept
 
 
 def test_the_rate_limiter_keeps_its_rate_and_the_newest() -> None:

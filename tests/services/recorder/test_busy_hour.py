@@ -19,7 +19,7 @@ HEIGHT = 740
 @pytest.mark.slow
 def test_after_an_hour_those_who_wait_come_first_and_eight_devices_have_room(path: Path) -> None:
     with Timeline("lab", path=path) as timeline:
-        timeline.bookings.told(0, busy_hour.booked(0, busy_hour.HOUR))
+        timeline.bookings.take(0, busy_hour.booked(0, busy_hour.HOUR))
         busy_hour.play(timeline)
         layout = timeline.layout(live=True)
         panes: Any = next(iter(blueprint(layout).root_container.contents))

@@ -92,7 +92,7 @@ def test_what_is_no_picture_is_left_out(path: Path, monkeypatch: pytest.MonkeyPa
             timeline.robots.frame(1, f"framegrabber/cam{number}", head(1), good)
     assert {name for name, _, _ in rows(path, "/camera/**", "EncodedImage:blob")} == {"/camera/cam0", "/camera/cam1"}
     assert events(path) == [
-        "timeline: bad sends what is no JPEG of at most 4096 pixels a side: left out",
+        "timeline: bad sends pictures that are no JPEG of at most 4096 pixels a side: left out",
         "timeline: more than 2 cameras: the pictures of the others are not shown",
     ]
 

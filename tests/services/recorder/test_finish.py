@@ -96,7 +96,7 @@ def test_a_process_of_its_own_thins_what_is_over_and_says_what_it_can_t(tmp_path
     (tmp_path / "third.rrd").write_bytes(b"no recording")
     code, words = done(Job(tmp_path / "third.rrd", job.layout))
     assert (code, words.count("\n")) == (1, 1)
-    assert "third.rrd can't be written anew, and stays as it is" in words
+    assert "third.rrd can't be rewritten, and stays as it is" in words
 
 
 def test_what_can_t_be_written_anew_stays_as_it_is(path: Path, tmp_path: Path) -> None:

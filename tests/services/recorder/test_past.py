@@ -79,7 +79,7 @@ def test_what_is_not_known_is_told_in_words() -> None:
     told = Journals(Span(0.0, ZERO + 5), [past(1, 200, 250)], False, {"anvil": anvil}, ["forge"])
     found = past_of(told, ZERO, ZERO, operator_priority=10)
     assert found.words == [
-        "the journals of anvil tell of 1 hold in the 0.278 h before this recording",
+        "the journals of anvil list 1 hold in the 0.278 h before this recording",
         "no journal of forge: off, older than 0.3.0, or too slow",
     ]
     # Nothing is said of when there was no journal yet, nor of what is recorded.
@@ -89,7 +89,7 @@ def test_what_is_not_known_is_told_in_words() -> None:
     ]
     assert [at + ZERO for at, _ in found.lanes["robot/a"]] == [200, 250, 300, 360, 990, ZERO]
     latest = past_of(Journals(Span(0.0, ZERO), [past(1, 900, 950)], True, {"anvil": anvil}, []), ZERO, ZERO, 10)
-    assert latest.words == ["the journals of anvil tell of the latest 1 hold in the 0.278 h before this recording"]
+    assert latest.words == ["the journals of anvil list the latest 1 hold in the 0.278 h before this recording"]
     assert len(latest.gaps) == 1
 
 
@@ -158,4 +158,4 @@ async def test_a_recorder_that_comes_late_shows_what_journals_tell(path: Path, t
     assert over - begun == pytest.approx(100, abs=1)
     assert over == pytest.approx(-50, abs=1)
     assert found["/devices/robot/a"][1][0] == 0
-    assert "the journals of x, y tell of 2 holds in the 1 h before this recording" in events(path)
+    assert "the journals of x, y list 2 holds in the 1 h before this recording" in events(path)

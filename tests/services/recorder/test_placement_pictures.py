@@ -30,7 +30,7 @@ def test_an_hour_of_placements_at_a_glance(path: Path, tmp_path: Path) -> None:
         play(timeline)
     picture, state = look(path, tmp_path, panes=8, height=HEIGHT)
     names = {view.name for view in state.views}
-    assert names >= {"What runs on each host", f"Load average (1 min) per host   {MARK_WORDS}"}
+    assert names >= {"Components on each host", f"Load average (1 min) per host   {MARK_WORDS}"}
     left = picture.crop((0, 0, round(WIDTH * PANES), HEIGHT))
     # The lanes of the six components, the first of them an ARC's colour too.
     for colour in PALETTE[:6]:

@@ -151,8 +151,8 @@ def test_one_building_is_shown_until_it_is_silent(path: Path) -> None:
         tracker.floor.plan(22, other, BuildingPlan("office", 6.0, 4.5, png()))
         tracker.floor.poses(23, other, poses([Placed("b", 2, 2)]))
     assert events(path) == [
-        "a second building, of basil/office, is not shown: that of anvil/living_room is",
-        "building room is silent: who is where is not known any more",
+        "a second building, of basil/office, is not shown beside that at anvil/living_room",
+        "building room is silent: positions are unknown",
     ]
     labels = [(at, value) for _, at, value in rows(path, "/floor/names", "Points2D:labels")]
     assert labels == [(7, ["a"]), (23, ["b"])]

@@ -285,7 +285,7 @@ def test_a_port_that_is_taken_is_a_clear_error(path: Path) -> None:
             Timeline("lab", path=path, port=port)
     assert str(caught.value) == (
         f"can't listen on 127.0.0.1, port {port} (Address already in use); "
-        "choose another port, or end the program that has it"
+        "choose another port, or stop the program that uses it"
     )
     assert not path.exists()
 

@@ -245,7 +245,7 @@ def test_what_is_booked_is_outlined_ahead_of_now(tmp_path: Path) -> None:
             booked("mend", "robot/b", 2, 6, maintenance=True),
             booked("film", "robot/c", 14, 6, danger="robot/c is gone"),
         ]
-        timeline.bookings.told(0, BookingsTold(now, bookings))
+        timeline.bookings.take(0, BookingsTold(now, bookings))
         timeline.event(SECONDS, "the end")
     picture, state = look(tmp_path / "run.rrd", tmp_path, panes=7)
     assert {one.name for one in AHEAD} <= {view.name for view in state.views}

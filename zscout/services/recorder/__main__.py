@@ -1,5 +1,5 @@
-"""The recorder as a program, `python -m zscout.services.recorder`: a job on standard input, a recording on
-disk and live, until that closes."""
+"""The recorder as a program, `python -m zscout.services.recorder`: reads a job from standard input, and records to disk
+and live until standard input closes."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ from zscout.services.recorder.process import (
 from zscout.types import SECOND
 
 try:
-    import rerun  # noqa: F401 - the first that is named where it is missing: it brings NumPy along
+    import rerun  # noqa: F401 - first, to be named if it is missing: it includes NumPy
 
     from zscout.services.recorder.finish import Job
     from zscout.services.recorder.recorder import Recorder, RecorderFailed
@@ -52,20 +52,20 @@ log = logging.getLogger("zscout.recorder")
 
 MAX_JOB: Final = 1_000_000
 PART: Final = 3_600.0
-"""Seconds after which a recording goes on in another file."""
+"""Seconds after which a recording continues in another file."""
 MAX_PART: Final = 250 * MEGABYTE
-"""Bytes, likewise."""
+"""Bytes after which a recording continues in another file."""
 CHECK_EVERY: Final = 30.0
-"""Seconds between two looks at that, and at the limit of all recordings."""
+"""Seconds between two checks of PART, MAX_PART and the limit of all recordings."""
 LOOK_EVERY: Final = 2.0
-"""Seconds between two looks whether the file can be written."""
+"""Seconds between two checks that the file can be written."""
 
 
 def main() -> None:
-    """Exit codes: 0 when it was ended, 1 when it failed, BAD_SETTINGS where trying again would not help."""
+    """Exit codes: 0 after a stop, 1 after a failure, BAD_SETTINGS if a restart would not help."""
     log_to_stderr("INFO", "%(asctime)s recorder %(levelname)s %(message)s")
     try:
-        # Libraries write to standard output as they like: what this program writes there goes round them.
+        # Redirect standard output of libraries to standard error; this program writes its lines to a copy.
         with os.fdopen(os.dup(1), "wb") as out:
             os.dup2(2, 1)
             job = decode_job(sys.stdin.buffer.readline(MAX_JOB))
@@ -82,7 +82,7 @@ def main() -> None:
 
 
 def _report(out: BinaryIO, fault: str) -> None:
-    with suppress(OSError):  # nobody reads it any more
+    with suppress(OSError):  # the reader is gone
         out.write(msgspec.json.encode(RecorderReport(fault=fault)) + b"\n")
         out.flush()
 
@@ -94,7 +94,7 @@ async def _record(job: RecorderJob, out: BinaryIO) -> None:
         loop.add_signal_handler(number, stop.set)
 
     def read() -> None:
-        """The program that started this holds the other end of standard input: its end is ours."""
+        """Stop at the end of standard input, which the program that started this one holds open."""
         if not os.read(0, 4096):
             loop.remove_reader(0)
             stop.set()
@@ -122,7 +122,7 @@ async def _record(job: RecorderJob, out: BinaryIO) -> None:
 
 
 class _Files:
-    """The file that is written, and those before it. Raises BadInput where it can't be written or served."""
+    """The present file, and the previous ones. Raises BadInput if it can't be written or served."""
 
     def __init__(self, settings: RecorderConfig, fleet: Fleet) -> None:
         self._settings, self._fleet = settings, fleet
@@ -145,15 +145,15 @@ class _Files:
         prune(self._settings.path, self._fleet.name, limit=self._settings.limit * MEGABYTE)
 
     async def keep(self, recorder: Recorder, out: BinaryIO) -> None:
-        """Goes on in another file now and then, also where this one can't be written, which is reported at once, and
-        removes the oldest. Does not return."""
+        """Continue in another file after PART, MAX_PART or if this file can't be written, which is reported at once,
+        and remove the oldest recordings. Does not return."""
         fault, due = "", time.monotonic() + CHECK_EVERY
         while True:
             await asyncio.sleep(min(LOOK_EVERY, CHECK_EVERY))
             before, fault = fault, await asyncio.to_thread(self.timeline.unwritten)
             if bool(fault) != bool(before):
                 _report(out, fault)
-                log.log(logging.ERROR if fault else logging.INFO, "%s", fault or f"records to {self.path}")
+                log.log(logging.ERROR if fault else logging.INFO, "%s", fault or f"recording to {self.path}")
             if time.monotonic() < due:
                 continue
             due = time.monotonic() + CHECK_EVERY
@@ -162,7 +162,7 @@ class _Files:
                     await self._roll(recorder.now())
             except (OSError, BadInput) as error:
                 if not fault:
-                    log.warning("the recording goes on in the same file: %s", error)
+                    log.warning("the recording continues in the same file: %s", error)
             self.prune()
 
     async def _roll(self, at: float) -> None:
@@ -183,7 +183,7 @@ class _Files:
 
 
 async def _finished(job: Job) -> None:
-    """Has a process of its own write the file anew: its memory goes with it."""
+    """Rewrite the file in a separate process, whose memory is freed with it."""
     command = (sys.executable, "-m", "zscout.services.recorder.finish")
     process = await asyncio.create_subprocess_exec(*command, stdin=asyncio.subprocess.PIPE)
     try:

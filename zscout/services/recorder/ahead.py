@@ -1,8 +1,7 @@
-"""The chart of what is booked: the rows of RCs, and ahead of now an outline for each date. Pure.
+"""The chart of bookings: a row for each RC, with an outline for each future date. Pure.
 
-Bars on the time axis would do for what was; but a viewer that follows a fleet goes to the newest time that it has, so
-nothing is logged at times to come: the chart is a picture of its own, drawn anew as time goes on. One unit of it is
-about a pixel."""
+The chart is a picture of its own, redrawn as time passes: a viewer that follows a fleet jumps to the newest time
+logged, so nothing may be logged at future times. One unit is about a pixel."""
 
 from __future__ import annotations
 
@@ -17,21 +16,21 @@ from zscout.services.recorder.colours import GRID, NOW, PALE, bright, faded
 from zscout.services.recorder.drawing import clean_text
 
 MAX_BARS: Final = 300
-"""Outlines in one chart: the first."""
+"""Outlines in one chart, the earliest."""
 LEFT: Final = 170.0
-"""Where now is: names stand before it."""
+"""Position of the present; names are to its left."""
 MARGIN: Final = 4.0
-"""Between an outline and the lines of its row."""
+"""Distance of an outline from the lines of its row."""
 LETTER: Final = 6.8
-"""Width of a letter, about: the viewer does not tell."""
+"""Approximate width of a letter; the viewer does not report it."""
 PADDING: Final = 14.0
-"""Beside a label, in all."""
+"""Space beside a label, both sides together."""
 HATCH: Final = 9.0
-"""From one line of a hatching to the next."""
+"""Distance of the lines of a hatching."""
 LABEL: Final = -12.0
-"""From the middle of a row to the point of a label, which stands below that."""
+"""Offset of a label's point from the middle of a row; the text is drawn below the point."""
 CLEAR: Final = 62.0, 40.0
-"""From the label of now to the first label of a time, and from the last one to the edge."""
+"""Least distance of a time's label from the label of the present, and from the edge."""
 MAX_NAME: Final = 30
 """Characters of an RC's name."""
 DAY: Final = 86_400
@@ -40,7 +39,7 @@ Point = tuple[float, float]
 
 
 class Bar(NamedTuple):
-    """A date on the row of one RC. Times in seconds since 1970; texts as others wrote them."""
+    """A date in the row of an RC. Times are in seconds since 1970; the text is not cleaned yet."""
 
     row: str
     start: float
@@ -53,7 +52,7 @@ class Bar(NamedTuple):
 
 
 class ChartLayer(NamedTuple):
-    """What an entity below the chart's shows; nothing where the first field is empty."""
+    """The shape of an entity below the chart's; empty if its first field is."""
 
     shape: type[rr.AsComponents]
     fields: dict[str, Any]
@@ -66,18 +65,18 @@ class _Placed(NamedTuple):
     top: float
     bottom: float
     room: float
-    """Up to here nothing else stands in its row."""
+    """Left edge of the next bar in its row."""
 
 
 def rows_of(bars: Iterable[Bar], now: float) -> int:
-    """Rows that the tallest chart takes."""
+    """Rows of the tallest chart."""
     known = [*bars]
     return max(len(_seated(_within(known, now, ahead.seconds))[0]) for ahead in AHEAD)
 
 
 def chart(bars: Iterable[Bar], now: float, ahead: Ahead, rows: int, *, stale: bool = False) -> dict[str, ChartLayer]:
-    """Layers by name; `rows`: those of the tallest chart. `stale`: nobody tells of bookings any more; `now` is when
-    somebody did."""
+    """Layers by name. `rows`: rows of the tallest chart. `stale`: bookings are not received any more; `now` is then the
+    time of the last answer."""
     within = _within(bars, now, ahead.seconds)
     names, seats = _seated(within)
     scale, high = (CHART_WIDTH - LEFT) / ahead.seconds, chart_row(rows)
@@ -89,8 +88,8 @@ def chart(bars: Iterable[Bar], now: float, ahead: Ahead, rows: int, *, stale: bo
     heads = [(LEFT, f"{'as of' if stale else 'now'} {_at(now):%H:%M}")] if names else []
     heads += [(x, text) for x, text in times if LEFT + CLEAR[0] < x < CHART_WIDTH - CLEAR[1]]
     shade = 0.4 if stale else 1.0
-    labels = [(*spot, bright(one.bar.colour)) for one in placed if (spot := _label(one)) is not None]
-    hatches = [(line, one.bar.colour) for one in placed if one.bar.hatched for line in _hatched(one)]
+    labels = [(*spot, bright(box.bar.colour)) for box in placed if (spot := _label(box)) is not None]
+    hatches = [(line, box.bar.colour) for box in placed if box.bar.hatched for line in _hatched(box)]
     return {
         "grid": _lines([(line, GRID) for line in grid], 0.5, 0.0),
         "now": _lines([([(LEFT, CHART_HEAD - 4), (LEFT, bottom)], NOW)] if names else [], 1.5, 40.0),
@@ -106,12 +105,12 @@ def chart(bars: Iterable[Bar], now: float, ahead: Ahead, rows: int, *, stale: bo
         "dates": ChartLayer(
             rr.Boxes2D,
             {
-                "mins": [(one.left, one.top) for one in placed],
-                "sizes": [(one.right - one.left, one.bottom - one.top) for one in placed],
-                "colors": [faded(one.bar.colour, shade) for one in placed],
-                "radii": [-2.5 if one.bar.thick else -1.0 for one in placed],
-                "labels": [one.bar.text for one in placed],
-                "show_labels": False,  # only when pointed at: they may be wider than the box
+                "mins": [(box.left, box.top) for box in placed],
+                "sizes": [(box.right - box.left, box.bottom - box.top) for box in placed],
+                "colors": [faded(box.bar.colour, shade) for box in placed],
+                "radii": [-2.5 if box.bar.thick else -1.0 for box in placed],
+                "labels": [box.bar.text for box in placed],
+                "show_labels": False,  # shown on hover: they may be wider than the box
                 "draw_order": 20.0,
             },
         ),
@@ -125,8 +124,9 @@ def _within(bars: Iterable[Bar], now: float, seconds: float) -> list[Bar]:
 
 
 def _seated(bars: Sequence[Bar]) -> tuple[list[str], list[int | None]]:
-    """The name of each row, "" below the first of an RC's; and the row of each bar: what is at one time stands one
-    below the other. Bars in the order in which they begin; past the limits they have none, and a last row says so."""
+    """Assign rows to bars, which are in order of their starts; simultaneous bars of an RC get separate rows. Return the
+    name of each row (empty below an RC's first), and the row of each bar (None beyond the limits, which add a last row
+    with the count)."""
     ends: dict[str, list[float]] = {}
     seats: list[tuple[str, int] | None] = []
     free = MAX_CHART_ROWS
@@ -168,25 +168,25 @@ def _placed(
     return reversed(found)
 
 
-def _label(one: _Placed) -> tuple[float, float, str] | None:
-    """Where its text stands, and how much of it: in the box; else behind it, where nothing else is; else a part."""
-    y, wide = (one.top + one.bottom) / 2 + LABEL, len(one.bar.text) * LETTER + PADDING
-    if wide <= one.right - one.left:
-        return (one.left + one.right) / 2, y, one.bar.text
-    if wide <= one.room - one.right:
-        return one.right + wide / 2, y, one.bar.text
-    inside = one.right - one.left >= one.room - one.right
-    begin, end = (one.left, one.right) if inside else (one.right, one.room)
+def _label(box: _Placed) -> tuple[float, float, str] | None:
+    """Position and text of a label: within the box if it fits, else in free space after it, else shortened."""
+    y, wide = (box.top + box.bottom) / 2 + LABEL, len(box.bar.text) * LETTER + PADDING
+    if wide <= box.right - box.left:
+        return (box.left + box.right) / 2, y, box.bar.text
+    if wide <= box.room - box.right:
+        return box.right + wide / 2, y, box.bar.text
+    inside = box.right - box.left >= box.room - box.right
+    begin, end = (box.left, box.right) if inside else (box.right, box.room)
     letters = int((end - begin - PADDING) / LETTER)
-    return ((begin + end) / 2, y, f"{one.bar.text[: letters - 1]}…") if letters >= 3 else None
+    return ((begin + end) / 2, y, f"{box.bar.text[: letters - 1]}…") if letters >= 3 else None
 
 
-def _hatched(one: _Placed) -> Iterator[list[Point]]:
-    """Lines from the lower left to the upper right, within the box."""
-    height, x = one.bottom - one.top, one.left - (one.bottom - one.top) + HATCH
-    while x < one.right:
-        begin, end = max(x, one.left), min(x + height, one.right)
-        yield [(begin, one.bottom - (begin - x)), (end, one.bottom - (end - x))]
+def _hatched(box: _Placed) -> Iterator[list[Point]]:
+    """Lines of a hatching from lower left to upper right, within the box."""
+    height, x = box.bottom - box.top, box.left - (box.bottom - box.top) + HATCH
+    while x < box.right:
+        begin, end = max(x, box.left), min(x + height, box.right)
+        yield [(begin, box.bottom - (begin - x)), (end, box.bottom - (end - x))]
         x += HATCH
 
 

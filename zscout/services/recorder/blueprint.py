@@ -1,4 +1,4 @@
-"""The layout of a recording in the Rerun viewer: a pane for each kind of thing that there is."""
+"""The layout of a recording in the Rerun viewer: a pane for each kind of content."""
 
 from __future__ import annotations
 
@@ -12,63 +12,63 @@ import rerun.blueprint as rrb
 APPLICATION: Final = "zscout"
 """Rerun's application id: recordings and blueprints find each other by it."""
 TIME: Final = "mesh_time"
-"""The timeline of what has no place in our time: a duration, in seconds from whatever zero the caller chose.
+"""The timeline of runs without wall-clock times: a duration, in seconds from a zero that the caller chose.
 
 The viewer makes the column of times in the event list as wide as this name: "time" cuts off `+10s`."""
 WALL_TIME: Final = "wall_clock_time"
-"""The timeline of a fleet that is recorded as it works. The viewer shows it in UTC, or in local time if set so."""
-# Legends stand in titles: they would cover the curves, or the plan.
+"""The timeline of a live fleet. The viewer shows it in UTC, or in local time if set so."""
+# Legends are in titles, as they would cover the curves or the plan.
 MARK_WORDS: Final = "▲ placed  ● restarted  ◀ moved away  ▶ moved here  \u00d7 given up"
 FLOOR_WORDS: Final = "green hidden, amber not yet, red operator, violet people"
 
 REQUESTS: Final = "What each request is doing"
 MARGIN: Final = 0.03
-"""Part of a finished run's length that is left free after its end."""
+"""Share of a finished run's length that is left free after its end."""
 LIVE_WINDOW: Final = 60.0
-"""Seconds of the past that a live view shows."""
+"""Seconds that a live view shows."""
 LIVE_ROWS: Final = 6
-"""RCs, and ARCs, that a live view with robots has room for at least: most come after the first robot."""
+"""Least rows for RCs, and for ARCs, in a live view with robots: most appear after the first robot."""
 LIVE_HOST_ROWS: Final = 10
-"""Components that a live view has room for."""
+"""Rows for components in a live view."""
 LIVE_BEHAVIOR_ROWS: Final = 9
 ONE_PANE: Final = 10
-"""Rows of devices that stand in one pane, whoever wants them."""
+"""Most rows of devices in a single pane."""
 FOLDED: Final = 8
-"""Lanes of requests past which those who wait have a pane, and all requests a tab of it."""
+"""Most lanes of requests without a separate pane of waiting requests, with all requests in a tab."""
 MAX_LANE_ROWS: Final = 12
-"""Rows of lanes that a pane has room for; it scrolls past them."""
+"""Visible rows of lanes in a pane, which scrolls beyond them."""
 MAX_WAITING_ROWS: Final = 6
-"""Rows of the pane of those who wait; more of them are summed up in the last row."""
+"""Rows of the pane of waiting requests; further requests are counted in the last row."""
 MOST_ROWS: Final = ONE_PANE + 1, FOLDED + 1, MAX_WAITING_ROWS
-"""Rows of devices, requests and those who wait from which more change nothing in the layout."""
+"""Rows of devices, requests and waiting requests beyond which the layout does not change."""
 FRAME: Final = 48
-"""Height of a pane's title and axis, in pixels as all heights here."""
+"""Height of a pane's title and axis, in pixels like all heights here."""
 TITLE: Final = 34
 """Height of the title of a pane without an axis."""
 ROW: Final = 41
 """Height of a lane with its label."""
 NEXT_ROW: Final = 23
-"""Height of a further row of one lane."""
+"""Height of a further row of a lane."""
 BANNER: Final = 64
 LOAD: Final = 200
-"""Least height of the loads: curves, axis and legend."""
+"""Least height of the load pane: curves, axis and legend."""
 LOAD_PART: Final = 0.3
-"""Least height of the loads as a part of that of the panes above."""
+"""Least height of the load pane as a share of the panes above."""
 LEGEND: Final = 6
-"""Curves that a legend leaves room for."""
+"""Most curves with a visible legend."""
 BESIDE: Final = 4
-"""Cameras side by side; more of them have pages of as many."""
+"""Cameras side by side; further cameras get further pages."""
 
 
 class Ahead(NamedTuple):
-    """A chart of what is booked."""
+    """A chart of bookings."""
 
     entity: str
     name: str
     seconds: int
-    """Up to when."""
+    """Seconds ahead of the present."""
     tick: int
-    """Seconds between two times that it names."""
+    """Seconds between two labelled times."""
 
 
 AHEAD: Final = (
@@ -77,25 +77,25 @@ AHEAD: Final = (
 )
 CHART_WIDTH: Final = 1_000.0
 CHART_HEAD: Final = 26.0
-"""Sizes of such a chart and of its line of times, in units of which one is about a pixel."""
+"""Width of a chart and height of its line of times, in units of about a pixel."""
 MAX_CHART_ROWS: Final = 12
-"""And one that says what is left out: the viewer makes all smaller that has no room, but for the texts."""
+"""Rows of a chart, without the row that counts the rest. The viewer shrinks charts that lack room, except texts."""
 
 
 class RobotLayout(NamedTuple):
-    """What there is of robots and other devices: panes are made for these."""
+    """Content about robots and other devices, for which panes are made."""
 
     cameras: tuple[tuple[str, str], ...] = ()
-    """Entity and title of each."""
+    """Entity and title of each camera."""
     floor: tuple[int, int] | None = None
     """Width and height of the plan's picture, in pixels."""
     behavior_rows: int = 0
     devices: int = 0
-    """Curves of their figures; more than LEGEND are all the same."""
+    """Curves of devices' figures; numbers above LEGEND are equivalent."""
 
     @property
     def any(self) -> bool:
-        """Whether the layout is that of a fleet with robots."""
+        """True for the layout of a fleet with robots."""
         return bool(self.cameras or self.floor or self.behavior_rows)
 
 
@@ -103,16 +103,16 @@ NO_ROBOTS: Final = RobotLayout()
 
 
 class Layout(msgspec.Struct, frozen=True):
-    """What there is to lay out.
+    """The content to lay out.
 
-    `span`: begin and end of a run that is over, in seconds of the timeline. Without it the layout is live: the window
-    slides with the newest data and shows the last minute. `wall`: whether the timeline has wall-clock times. `rc_rows`,
-    `arc_rows` and `host_rows` are the rows expected in the upper panes, which share the height accordingly. Without
-    components `host_rows` is 0. `waiting_rows` are those of the requests that wait, in a pane of their own; 0: no such
-    pane. `banner`: a text above all panes. `contended` and `absent` are rows by entity of devices that several want,
-    and of those that are not there: past ONE_PANE rows they have panes of their own, above the other devices and below
-    them. `ahead`: rows of the charts of what is booked; 0: none. `past`: seconds before the begin
-    that the journals know, 0: none; `only_past` are entities of devices of which nothing else is known."""
+    `span`: start and end of a finished run, in seconds of the timeline; None for a live layout, whose window follows
+    the newest data and shows the last minute. `wall`: the timeline has wall-clock times. `rc_rows`, `arc_rows` and
+    `host_rows`: rows expected in the upper panes, which share the height accordingly; `host_rows` is 0 without
+    components. `waiting_rows`: rows of the pane of waiting requests, 0 without that pane. `banner`: a text above all
+    panes. `contended` and `absent`: rows by entity of devices that several requests want, and of absent devices; beyond
+    ONE_PANE rows they get panes above and below the other devices. `ahead`: rows of the charts of bookings, 0 without.
+    `past`: seconds before the start from journals, 0 without; `only_past`: entities of devices known only from
+    these."""
 
     span: tuple[float, float] | None = None
     wall: bool = False
@@ -130,11 +130,11 @@ class Layout(msgspec.Struct, frozen=True):
 
 
 def blueprint(layout: Layout) -> rrb.Blueprint:
-    """Who waits, who holds what and what each request does on one time axis, events and loads beside them; with
-    components, also what runs on each host and what it uses, and the loads below that.
+    """Lay out waiting requests, holders of devices and states of requests on one time axis, with events and loads
+    beside them; with components also the components of each host and their use, with the loads below.
 
-    A pane of devices or requests that would be empty beside components is left out. With robots, their behaviors follow
-    the requests, loads and hosts share a place, and floor and cameras are at the right, above the events."""
+    Empty panes of devices or requests are left out beside components. With robots, behaviors follow the requests, loads
+    and hosts share a place, and floor and cameras are at the right, above the events."""
     span, robots, host_rows = layout.span, layout.robots, layout.host_rows
     axis = rrb.archetypes.TimeAxis(view_range=_window(span))
     behavior_rows = LIVE_BEHAVIOR_ROWS if span is None and robots.behavior_rows else robots.behavior_rows
@@ -147,7 +147,7 @@ def blueprint(layout: Layout) -> rrb.Blueprint:
             origin: (_share(rows), rrb.StateTimelineView(origin=origin, name=name, time_view=axis))
             for origin, name, rows, alone in (
                 ("/requests", REQUESTS, 0 if waiting else layout.arc_rows, not host_rows and not waiting),
-                ("/host", "What runs on each host", host_rows, False),
+                ("/host", "Components on each host", host_rows, False),
                 ("/behavior", "What each behavior is doing", behavior_rows if robots.any else 0, False),
             )
             if rows or alone
@@ -178,7 +178,7 @@ def blueprint(layout: Layout) -> rrb.Blueprint:
 
 
 def _waiting_pane(layout: Layout, axis: rrb.archetypes.TimeAxis) -> dict[str, tuple[int, rrb.View | rrb.Container]]:
-    """Those who wait, and in a tab all requests; nothing where all requests have room."""
+    """The pane of waiting requests, with all requests in a tab; none if all requests have room."""
     if not layout.waiting_rows:
         return {}
     waiting = rrb.StateTimelineView(origin="/who", name="Who waits, and for whom", time_view=axis)
@@ -188,21 +188,21 @@ def _waiting_pane(layout: Layout, axis: rrb.archetypes.TimeAxis) -> dict[str, tu
 
 
 def chart_row(rows: int) -> float:
-    """How high a row of charts is of which the taller one has so many."""
+    """Height of a chart's row; `rows`: rows of the tallest chart."""
     return 26.0 if rows <= 4 else 24.0
 
 
 def _charts(rows: int) -> dict[str, tuple[int, rrb.View | rrb.Container]]:
-    """What is booked, as pages of one pane; none without rows."""
+    """The charts of bookings, as pages of one pane; none without rows."""
     bounds = rrb.VisualBounds2D(x_range=[0, CHART_WIDTH], y_range=[0, CHART_HEAD + chart_row(rows) * rows])
-    views = [rrb.Spatial2DView(origin=one.entity, name=one.name, visual_bounds=bounds) for one in AHEAD if rows]
+    views = [rrb.Spatial2DView(origin=chart.entity, name=chart.name, visual_bounds=bounds) for chart in AHEAD if rows]
     height = TITLE + round(CHART_HEAD + rows * chart_row(rows))
     return {"/ahead": (height, rrb.Tabs(*views))} if views else {}
 
 
 def _rc_panes(layout: Layout, axis: rrb.archetypes.TimeAxis) -> dict[str, tuple[int, rrb.View | rrb.Container]]:
-    """Share of the height and view, by any name. Within a view lanes are sorted by their names: what is to stand above
-    them has a view of its own, and room to be seen whole."""
+    """Views of devices with their share of the height, by title. A view sorts lanes by name, so contended devices have
+    a view of their own above the others, high enough for all."""
     few = layout.rc_rows <= ONE_PANE
     contended, absent = ({}, {}) if few else (layout.contended, layout.absent)
     apart = {**contended, **absent}
@@ -230,7 +230,7 @@ def _rc_panes(layout: Layout, axis: rrb.archetypes.TimeAxis) -> dict[str, tuple[
 
 
 def _past(layout: Layout) -> rrb.View:
-    """The same lanes, with the time before."""
+    """The lanes of devices, including the past."""
     relative, absolute = rr.TimeRangeBoundary.cursor_relative, rr.TimeRangeBoundary.absolute
     if layout.span is None:
         window = rr.TimeRange(start=relative(seconds=-layout.past), end=relative(seconds=layout.past * MARGIN))
@@ -258,10 +258,10 @@ def page(
 
 
 def _beside(axis: rrb.archetypes.TimeAxis, uses: bool, robots: RobotLayout, time: str) -> rrb.View | rrb.Container:
-    """The panes at the right, from the top: the floor, the cameras, events and curves; as tabs if there are robots."""
+    """The panes at the right: floor, cameras, events and curves; with robots, events and curves are tabs."""
 
     def curves(origin: str, name: str, number: int = LEGEND + 1) -> rrb.View:
-        # A legend of many would cover the curves.
+        # A long legend would cover the curves.
         legend = rrb.PlotLegend(rrb.Corner2D.LeftTop, visible=number <= LEGEND)
         return rrb.TimeSeriesView(origin=origin, name=name, axis_x=axis, plot_legend=legend)
 
@@ -270,7 +270,7 @@ def _beside(axis: rrb.archetypes.TimeAxis, uses: bool, robots: RobotLayout, time
     presence = rrb.TextLogView(origin="/presence", name="Who comes and goes", columns=columns)
     below: list[rrb.View | rrb.Container] = [events, presence] if robots.any else [rrb.Tabs(events, presence)]
     if uses:
-        # As tabs they have little room for words.
+        # The titles of tabs have little room.
         more = ("", "") if robots.any else (" of the heaviest components", ", in the colours of the lanes")
         below.append(curves("/use/cpu", f"CPU{more[0]} (cores){more[1]}"))
         below.append(curves("/use/memory", f"Memory{more[0]} (MB)"))
@@ -305,7 +305,7 @@ def _window(span: tuple[float, float] | None) -> rr.TimeRange:
         relative = rr.TimeRangeBoundary.cursor_relative
         return rr.TimeRange(start=relative(seconds=-LIVE_WINDOW), end=relative(seconds=2.0))
     begin, end = span
-    # A run of one instant would be an empty range, which shows nothing.
+    # At least 1 s: an empty range would show nothing.
     length = max(end - begin, 1.0) * (1 + MARGIN)
     absolute = rr.TimeRangeBoundary.absolute
     return rr.TimeRange(start=absolute(seconds=begin), end=absolute(seconds=begin + length))

@@ -1,4 +1,4 @@
-"""Bookings as the leader tells of them, put together for the timeline: pure; times are passed in."""
+"""The leader's bookings, for the timeline. Pure; times are passed in."""
 
 from __future__ import annotations
 
@@ -13,54 +13,54 @@ from zscout.services.recorder.colours import ALERT, FAILED, MAINTENANCE
 from zscout.services.recorder.drawing import Drawing
 
 AGAIN: Final = 60.0
-"""Seconds until the charts are drawn anew though no booking has changed: now goes on."""
+"""Seconds after which charts are redrawn without a change, as time passes."""
 STALE: Final = 60.0
-"""Seconds without word of bookings after which the charts show that."""
-MAX_TOLD: Final = 50
-"""Events that one answer may make."""
+"""Seconds without an answer after which the charts are marked as outdated."""
+MAX_EVENTS: Final = 50
+"""Events caused by one answer."""
 AHEAD_OF_NOW: Final = ("open", "taken", "conflict")
 """States of dates that are not over."""
 
 Key: TypeAlias = tuple[str, int]
-"""A booking's id, and when a date of it starts."""
+"""A booking's id, and the start of one of its dates."""
 Dated: TypeAlias = tuple[BookingView, BookedDate]
 Event: TypeAlias = tuple[str, str]
-"""Words and level."""
+"""Text and level."""
 
 
 class BookingTracker:
-    """Draws what is booked, and tells what changes; `colour` gives a name its RGBA."""
+    """Draws bookings, and logs their changes as events; `colour` returns the RGBA of a name."""
 
     def __init__(self, drawing: Drawing, colour: Callable[[str], int]) -> None:
         self._drawing, self._colour = drawing, colour
         self.rows = 0
-        """That the charts take; 0: nothing is booked."""
+        """Rows of the charts; 0 without bookings."""
         self._bookings: list[BookingView] | None = None
-        """None: nobody has told yet."""
+        """None before the first answer."""
         self._zero = 0.0
         """Fleet time of second 0."""
-        self._told = self._drawn = 0.0
-        """When bookings were told last, and drawn."""
+        self._received = self._drawn = 0.0
+        """Times of the last answer, and of the last drawing."""
         self._stale = False
 
-    def told(self, at: float, told: BookingsTold) -> None:
-        """All bookings there are."""
-        self._told, self._zero = at, told.time - at
-        bookings = [one for one in told.bookings if not one.unbooked]
+    def take(self, at: float, answer: BookingsTold) -> None:
+        """Take the list of all bookings."""
+        self._received, self._zero = at, answer.time - at
+        bookings = [booking for booking in answer.bookings if not booking.unbooked]
         if bookings != self._bookings:
-            self._tell(at, bookings)
+            self._log_changes(at, bookings)
             self._bookings = bookings
             self._draw(at)
 
     def tick(self, at: float) -> None:
-        """What time alone brings: call it now and then."""
-        if self._bookings is not None and (at - self._drawn >= AGAIN or (at - self._told > STALE) != self._stale):
+        """Update for the passing of time; called regularly."""
+        if self._bookings is not None and (at - self._drawn >= AGAIN or (at - self._received > STALE) != self._stale):
             self._draw(at)
 
     def _draw(self, at: float) -> None:
-        self._drawn, self._stale = at, at - self._told > STALE
-        now = self._zero + (self._told if self._stale else at)
-        bars = [bar for one in self._bookings or () for bar in self._bars(one, now)]
+        self._drawn, self._stale = at, at - self._received > STALE
+        now = self._zero + (self._received if self._stale else at)
+        bars = [bar for booking in self._bookings or () for bar in self._bars(booking, now)]
         self.rows = rows_of(bars, now)
         for ahead in AHEAD:
             for name, layer in chart(bars, now, ahead, self.rows, stale=self._stale).items():
@@ -68,7 +68,7 @@ class BookingTracker:
         self._drawing.arrange()
 
     def _bars(self, booking: BookingView, now: float) -> Iterator[Bar]:
-        """One for each RC of each date that a chart may show."""
+        """Yield a bar for each RC of each date within the charts."""
         latest = now + max(ahead.seconds for ahead in AHEAD)
         for date in booking.dates:
             if date.state not in AHEAD_OF_NOW or not (date.start < latest and now < date.end):
@@ -86,60 +86,67 @@ class BookingTracker:
             for rc in _rcs(booking, date):
                 yield Bar(rc, date.start, date.end, text, colour, thick=taken, hatched=booking.maintenance)
 
-    # In words
+    # Events
 
-    def _tell(self, at: float, bookings: list[BookingView]) -> None:
-        """What is another than it was. At first only what people should look at: the rest did not happen now."""
+    def _log_changes(self, at: float, bookings: list[BookingView]) -> None:
+        """Log changes as events. The first answer gives only warnings: the rest did not happen now."""
         first, before, after = self._bookings is None, _dates(self._bookings or ()), _dates(bookings)
-        known = {one.id for one in self._bookings or ()}
-        words = [] if first else [_made(one) for one in bookings if one.id not in known and one.dates]
-        words += [news for key, (one, date) in after.items() for news in _news(one, date, before.get(key))]
+        known = {booking.id for booking in self._bookings or ()}
+        words = [] if first else [_made(booking) for booking in bookings if booking.id not in known and booking.dates]
+        words += [news for key, (booking, date) in after.items() for news in _news(booking, date, before.get(key))]
         words += _gone(
-            [one for key, one in before.items() if key not in after], {one.id for one in bookings}, self._zero + at
+            [dated for key, dated in before.items() if key not in after],
+            {booking.id for booking in bookings},
+            self._zero + at,
         )
-        for text, level in words[:MAX_TOLD]:
+        for text, level in words[:MAX_EVENTS]:
             self._drawing.event(at, text, level)
-        if len(words) > MAX_TOLD:
-            self._drawing.event(at, f"and {len(words) - MAX_TOLD} more changes of bookings")
+        if len(words) > MAX_EVENTS:
+            self._drawing.event(at, f"and {len(words) - MAX_EVENTS} more changes of bookings")
 
 
 def _dates(bookings: Iterable[BookingView]) -> dict[Key, Dated]:
-    return {(one.id, date.start): (one, date) for one in bookings for date in one.dates if date.state in AHEAD_OF_NOW}
+    return {
+        (booking.id, date.start): (booking, date)
+        for booking in bookings
+        for date in booking.dates
+        if date.state in AHEAD_OF_NOW
+    }
 
 
-def _made(one: BookingView) -> Event:
-    if one.broken:
-        return f"{', '.join(_rcs(one, one.dates[0]))} reported broken by {one.owner}: {_named(one)}", "WARN"
-    again = "" if not one.every else ", and every day" if one.every == 1 else f", and every {one.every} days"
-    return f"{_subject(one)} is made: {', '.join(_rcs(one, one.dates[0]))}, {_span(one.dates[0])}{again}", "INFO"
+def _made(view: BookingView) -> Event:
+    if view.broken:
+        return f"{', '.join(_rcs(view, view.dates[0]))} reported broken by {view.owner}: {_named(view)}", "WARN"
+    again = "" if not view.every else ", and every day" if view.every == 1 else f", and every {view.every} days"
+    return f"{_subject(view)} is made: {', '.join(_rcs(view, view.dates[0]))}, {_span(view.dates[0])}{again}", "INFO"
 
 
-def _news(one: BookingView, date: BookedDate, before: Dated | None) -> Iterator[Event]:
+def _news(view: BookingView, date: BookedDate, before: Dated | None) -> Iterator[Event]:
     state, danger = ("open", "") if before is None else (before[1].state, before[1].danger)
     if date.state == "conflict" and (state, danger) != ("conflict", date.danger):
-        yield f"{_subject(one)}, {_span(date)}, can't be: {date.danger or 'another stands'}", "WARN"
+        yield f"{_subject(view)}, {_span(date)}, can't be: {date.danger or 'another takes precedence'}", "WARN"
     elif date.danger and date.danger != danger:
-        yield f"{_subject(one)} may not start {_span(date)}: {date.danger}", "WARN"
+        yield f"{_subject(view)} may not start {_span(date)}: {date.danger}", "WARN"
     elif (state == "conflict" and date.state != state) or (danger and not date.danger):
-        yield f"{_subject(one)}, {_span(date)}, stands again", "INFO"
+        yield f"{_subject(view)}, {_span(date)}, stands again", "INFO"
     elif date.state == "taken" and before is not None and state != "taken":
-        yield f"{_subject(one)} is taken up", "INFO"
+        yield f"{_subject(view)} is taken up", "INFO"
 
 
 def _gone(gone: Iterable[Dated], known: Container[str], now: float) -> Iterator[Event]:
-    """Of dates that are told no more: who had taken one up is spoken of elsewhere. `known`: bookings that are there."""
+    """Yield events of dates that disappeared, unless they were taken up. `known`: the present bookings."""
     given_up = set[str]()
-    for one, date in gone:
+    for view, date in gone:
         if date.state == "taken" or now >= date.end:
             continue
-        if not one.maintenance and now >= date.start + float(one.patience):
-            yield f"{_subject(one)} has lapsed: nobody took it up", "WARN"
-        elif one.id in known:
-            yield f"{_subject(one)}, {_span(date)}, is given up", "INFO"
-        elif one.id not in given_up:
-            given_up.add(one.id)
-            rcs = ", ".join(_rcs(one, date))
-            yield f"{rcs} no longer reported broken" if one.broken else f"{_subject(one)} is given up", "INFO"
+        if not view.maintenance and now >= date.start + float(view.patience):
+            yield f"{_subject(view)} has lapsed: it was not taken up", "WARN"
+        elif view.id in known:
+            yield f"{_subject(view)}, {_span(date)}, is given up", "INFO"
+        elif view.id not in given_up:
+            given_up.add(view.id)
+            rcs = ", ".join(_rcs(view, date))
+            yield f"{rcs} no longer reported broken" if view.broken else f"{_subject(view)} is given up", "INFO"
 
 
 def _rcs(booking: BookingView, date: BookedDate) -> list[str]:
@@ -152,7 +159,7 @@ def _subject(booking: BookingView) -> str:
 
 
 def _named(booking: BookingView) -> str:
-    """The comment of a report of broken devices if it has one, else the booking's name."""
+    """The comment of a report of broken devices, else the booking's name."""
     comment = booking.who.comment if booking.broken and booking.who is not None else ""
     return comment or booking.name
 

@@ -1,4 +1,4 @@
-"""Colours of a recording, RGBA. Of robots green is hidden, amber not yet, yellow an alert."""
+"""Colours of a recording, RGBA. Robots are green when hidden, amber before, yellow at an alert."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from typing import Final
 import rerun as rr
 
 OPERATOR: Final = 0xFF1463FF
-"""RGBA of operator takeovers and preemptions, and of nothing else."""
+"""RGBA reserved for operator takeovers and preemptions."""
 FAILED: Final = 0xFF3B1FFF
-"""RGBA of what was given up."""
+"""RGBA of failures that are not retried, and of conflicts."""
 PALETTE: Final[tuple[int, ...]] = (
     0x4E79A7FF,  # blue
     0xF28E2BFF,  # orange
@@ -26,15 +26,15 @@ PALETTE: Final[tuple[int, ...]] = (
     0x1F6E5AFF,  # pine
     0xDCDCE4FF,  # pearl
 )
-"""RGBA of ARCs, in order of appearance; the fifteenth has the colour of the first."""
+"""RGBA of ARCs, in order of appearance; repeated after the last."""
 OTHER: Final = 0x8A8A94FF
-"""RGBA of what has no colour of its own: a summary, or an ARC past the limit of names."""
+"""RGBA of bars without a colour of their own: a summary, or an ARC beyond the limit of names."""
 ABSENT: Final = 0x55555CFF
-"""RGBA of an RC that is not there."""
+"""RGBA of an absent RC."""
 MAINTENANCE: Final = 0xC0C6D4FF
-"""RGBA of a booking for which nobody is to hold anything."""
+"""RGBA of maintenance."""
 GRID: Final = 0x3A3F4AFF
-"""RGBA of the lines between rows of a chart, and at its times."""
+"""RGBA of a chart's lines between rows and at times."""
 NOW: Final = 0xF4F6FAFF
 STATES: Final[dict[str, int]] = {
     "waiting": 0x6E5A20FF,
@@ -42,9 +42,9 @@ STATES: Final[dict[str, int]] = {
     "preempted": OPERATOR,
     "done": 0x2A2A31FF,
 }
-"""RGBA of the state of a request; a state that is not named here gets `OTHER`."""
+"""RGBA of the states of a request; others get `OTHER`."""
 LINES: Final[tuple[int, ...]] = (0x56C1FFFF, 0xFFB454FF, 0xB5E07BFF, 0xD6A6FFFF, 0xFFF08AFF, 0x5FE0CFFF)
-"""RGBA of the load curves, host by host; brighter than `PALETTE`, as a line is thin."""
+"""RGBA of load curves by host; brighter than `PALETTE`, as lines are thin."""
 MARKS: Final[dict[str, tuple[int, rr.components.MarkerShape]]] = {
     "placed": (0xFFFFFFFF, rr.components.MarkerShape.Up),
     "restarted": (0xFFE14DFF, rr.components.MarkerShape.Circle),
@@ -52,15 +52,15 @@ MARKS: Final[dict[str, tuple[int, rr.components.MarkerShape]]] = {
     "came": (0xC9A2FFFF, rr.components.MarkerShape.Right),
     "given_up": (FAILED, rr.components.MarkerShape.Cross),
 }
-"""RGBA and shape of what happened to a component, on the load curve of its host."""
+"""RGBA and shape of a component's events on the load curve of its host."""
 ALERT: Final = 0xFFE11AFF
 HIDDEN: Final = 0x35C76BFF
 IN_THE_OPEN: Final = 0xF59300FF
 CAMERA: Final = 0x4FC3FFFF
-"""RGBA of the field of view of a camera that is on."""
+"""RGBA of the field of view of an active camera."""
 PERSON: Final = 0xB46BFFFF
 PALE: Final = 0xD8DCE4FF
-"""RGBA of plain words."""
+"""RGBA of plain text."""
 DOING: Final[dict[str, int]] = {
     "search": 0x2F6FD6FF,
     "approach": 0x17A2B8FF,
@@ -76,14 +76,14 @@ DOING: Final[dict[str, int]] = {
     "lost": 0xC3C7D0FF,
     "operator": OPERATOR,
 }
-"""RGBA of what a behavior is doing; other words have that of what has none of its own."""
+"""RGBA of a behavior's activity; other activities get `OTHER`."""
 
 
 def faded(colour: int, part: float) -> int:
-    """An RGBA colour, seen through by 1 - `part`."""
+    """The colour with opacity `part`."""
     return colour & 0xFFFFFF00 | round(255 * part)
 
 
 def bright(colour: int) -> int:
-    """The colour of a text: halfway to white, for the viewer writes on what is half dark."""
+    """A text colour, halfway to white: the viewer writes on a half-dark background."""
     return sum((((colour >> shift & 0xFF) + 0xFF) // 2) << shift for shift in (24, 16, 8)) | colour & 0xFF

@@ -1,7 +1,7 @@
-"""What a recording is drawn with: lanes of bars, curves, shapes that stay until they change, and events.
+"""Primitives of a recording: lanes of bars, curves, shapes that stay until they change, and events.
 
-Names and texts come from the mesh: their number and length are bounded here, and what the viewer can't show is
-replaced."""
+Names and texts come from the mesh: their number and length are bounded here, and characters that the viewer can't show
+are replaced."""
 
 from __future__ import annotations
 
@@ -24,20 +24,20 @@ from zscout.services.recorder.colours import OPERATOR, OTHER, PALE
 from zscout.types import clean
 
 ROOM: Final = 1 << 16
-"""Bytes: with less a disk is full."""
+"""Bytes of free space below which a disk counts as full."""
 MAX_SECONDS: Final = 9e9
-"""Rerun counts nanoseconds in 64 bits."""
+"""Limit of times: Rerun counts nanoseconds in 64 bits."""
 CURVE_TICK: Final = 5.0
-"""Seconds for which the points of curves gather: a viewer takes its time for each piece that it gets, however small."""
+"""Seconds for which points of curves are collected: a viewer needs time for each chunk, however small."""
 MAX_SLOTS: Final = 8
-"""Rows of one lane that shows several things; more of them are summed up in the last row."""
+"""Rows of one lane; further bars are counted in its last row."""
 MAX_STATE: Final = 120
 MAX_EVENT: Final = 500
 """Characters."""
 COMPONENT: Final = "component "
-"""Begins the command of a request that a component made: no person stands behind it."""
-# Latin, Greek and Cyrillic letters, dashes, quotation marks, arrows. The viewer's font lacks others, and the
-# viewer ends where it is to draw what its font lacks.
+"""Prefix of the command of a request made by a component, not by a person."""
+# Latin, Greek and Cyrillic letters, dashes, quotation marks, arrows. The viewer's font lacks other characters, and
+# drawing such a character ends the viewer.
 _UNKNOWN: Final = re.compile(
     "[^ -~\u00a1-\u0148\u014a-\u017f\u0391-\u03c9\u0400-\u045f"
     "\u2013\u2014\u2018\u2019\u201c\u201d\u2026\u20ac\u2190\u2192]"
@@ -45,27 +45,27 @@ _UNKNOWN: Final = re.compile(
 
 
 class Drawing:
-    """One recording on one timeline, written to each of `streams`. `at` is seconds, of a size below `MAX_SECONDS`; any
-    other number is a ValueError. After `closed` nothing is written."""
+    """One recording on one timeline, written to each of `streams`. `at` is in seconds, with an absolute value below
+    MAX_SECONDS, else ValueError is raised. Once `closed`, nothing is written."""
 
     def __init__(self, *streams: rr.RecordingStream) -> None:
         self.streams = list(streams)
         self.epoch: float | None = None
-        """The wall-clock time of second 0, as `time.time()` has it; None: the timeline has durations."""
+        """Wall-clock time of second 0, as from `time.time()`; None if the timeline has durations."""
         self.closed = False
         self.begin, self.end = math.inf, -math.inf
         self._static: dict[str, tuple[rr.AsComponents, ...]] = {}
-        """What was logged for all times, by entity."""
+        """Static data logged, by entity."""
         self._shown: dict[str, tuple[Callable[..., rr.AsComponents], dict[str, Any]]] = {}
-        """Shape and fields of what was shown last, by entity."""
+        """The present shape and its fields, by entity."""
         self._noted: set[str] = set()
         self._points: dict[str, list[tuple[float, float]]] = {}
-        """Times and values that gather, by entity."""
+        """Collected points (time and value), by entity."""
         self._gathered = math.inf
-        """When the oldest of them was told."""
+        """Time of the oldest collected point."""
 
     def log(self, at: float | None, entity: str, *what: rr.AsComponents) -> None:
-        """Logs at a time, or for all times if that is None."""
+        """Log at a time, or statically for all times if `at` is None."""
         if self.closed:
             return
         if at is not None:
@@ -81,7 +81,7 @@ class Drawing:
         self.begin, self.end = min(self.begin, at), max(self.end, at)
 
     def point(self, at: float, entity: str, value: float) -> None:
-        """One point of a curve; it may be written seconds later."""
+        """Add a point to a curve; it may be written seconds later."""
         if self.closed:
             return
         self._reaches(at)
@@ -90,7 +90,7 @@ class Drawing:
         self.pass_points(at)
 
     def pass_points(self, at: float = math.inf) -> None:
-        """Writes the points that have gathered for long enough at this time."""
+        """Write collected points if the oldest is CURVE_TICK seconds old at `at`."""
         if at - self._gathered < CURVE_TICK:
             return
         for entity, points in self._points.items():
@@ -99,21 +99,21 @@ class Drawing:
         self._gathered = math.inf
 
     def columns(self, entity: str, times: Sequence[float], columns: rr.ComponentColumnList) -> None:
-        """Logs at many times as one piece: neither begin nor end are moved."""
+        """Log at many times as one chunk, without changing `begin` and `end`."""
         at = [time if self.epoch is None else self.epoch + time for time in times]
         index = rr.TimeColumn(TIME, duration=at) if self.epoch is None else rr.TimeColumn(WALL_TIME, timestamp=at)
         for stream in self.streams:
             stream.send_columns(entity, indexes=[index], columns=columns)
 
     def restate(self, stream: rr.RecordingStream, at: float) -> None:
-        """Writes to a stream that begins at `at` what was logged for all times, and what is shown now."""
+        """Write the static data and the present shapes to a stream that starts at `at`."""
         for entity, what in self._static.items():
             self._write(stream, None, entity, *what)
         for entity, (shape, fields) in self._shown.items():
             self._write(stream, at, entity, _shaped(shape, fields))
 
     def _write(self, stream: rr.RecordingStream, at: float | None, entity: str, *what: rr.AsComponents) -> None:
-        # Rerun keeps the time for each thread.
+        # Rerun keeps a time for each thread.
         if at is not None and self.epoch is None:
             stream.set_time(TIME, duration=at)
         elif at is not None and self.epoch is not None:
@@ -121,7 +121,7 @@ class Drawing:
         stream.log(entity, *what, static=at is None)
 
     def show(self, at: float, entity: str, shape: Callable[..., rr.AsComponents], **fields: Any) -> None:
-        """From `at` on, the entity shows this shape; nothing if its first field is empty."""
+        """Show this shape at the entity from `at` on; erase it if its first field is empty."""
         if not next(iter(fields.values())):
             if entity in self._shown:
                 self.erase(at, entity)
@@ -129,59 +129,59 @@ class Drawing:
             self.show_again(at, entity, shape, **fields)
 
     def show_again(self, at: float, entity: str, shape: Callable[..., rr.AsComponents], **fields: Any) -> None:
-        """The same, though nothing may have changed."""
+        """Show a shape even if it has not changed."""
         self._shown[entity] = shape, fields
         self.log(at, entity, _shaped(shape, fields))
 
     def erase(self, at: float, entity: str) -> None:
-        """What the entity shows ends, and so does a curve: no line goes on to its next point."""
+        """End the entity's shape or curve: no line connects to the next point."""
         self._shown.pop(entity, None)
         self.log(at, entity, rr.Clear(recursive=False))
 
     def curve(self, entity: str, name: str, colour: int, width: float, **more: Any) -> None:
-        """How the points of this entity are joined."""
+        """Set the line style of a curve."""
         self.log(None, entity, rr.SeriesLines(names=[clean_text(name)], colors=[colour], widths=[width], **more))
 
     def event(self, at: float, text: str, level: str = "INFO", *, operator: bool = False) -> None:
-        """One line in words; `level` is one of Rerun's, `operator` whether an operator did it."""
-        # Never none: the viewer would give the line the colour of the one before.
+        """Log one line of text; `level` is one of Rerun's; `operator`: caused by an operator."""
+        # Always a colour: without it the viewer takes the previous line's.
         colour = OPERATOR if operator else PALE
         self.log(at, "events", rr.TextLog(clean_text(text, MAX_EVENT), level=level, color=colour))
 
     def warn(self, at: float, text: str, *, operator: bool = False) -> None:
-        """An event that people should look at."""
+        """Log an event that needs attention."""
         self.event(at, text, "WARN", operator=operator)
 
     def presence(self, at: float, text: str, level: str = "INFO") -> None:
-        """Who comes and goes: a list of its own, which would bury the events."""
+        """Log a change of presence, in a separate list, as these would bury the events."""
         self.log(at, "presence", rr.TextLog(clean_text(text, MAX_EVENT), level=level))
 
     def note(self, at: float, text: str) -> None:
-        """Reports, once, that something is left out."""
+        """Report once that something is left out."""
         if text not in self._noted:
             self._noted.add(text)
             self.warn(at, f"timeline: {text}")
 
     def room(self, at: float, known: Sized, limit: int, others: str) -> bool:
-        """Whether `known` may have one more; if not, it is noted that there are "more than `limit` `others`"."""
+        """Return True if `known` may grow; if not, note that there are "more than `limit` `others`"."""
         if len(known) < limit:
             return True
         self.note(at, f"more than {limit} {others}")
         return False
 
     def arrange(self) -> None:
-        """There may be something new to lay out."""
+        """Called when there may be something new to lay out."""
 
     def flush(self, seconds: float) -> None:
-        """Returns when all is written. Raises RuntimeError and ValueError where it can't be."""
+        """Return when all is written. Raises RuntimeError or ValueError if that fails."""
         self.pass_points()
         for stream in self.streams:
             stream.flush(timeout_sec=seconds)
 
 
 def unwritten(stream: rr.RecordingStream, path: Path, seconds: float) -> str:
-    """Why what was logged is not in the file after so many seconds; empty: it is. Rerun's writer ends at its first
-    error, and only a flush shows that."""
+    """Why logged data is not in the file after `seconds`; empty if it is. Rerun's writer ends at its first error, and
+    only a flush shows that."""
     try:
         stream.flush(timeout_sec=seconds)
     except (RuntimeError, ValueError) as error:
@@ -194,8 +194,8 @@ def unwritten(stream: rr.RecordingStream, path: Path, seconds: float) -> str:
 
 
 def disconnect(stream: rr.RecordingStream, seconds: float) -> bool:
-    """Whether the stream has ended in time. A viewer that hangs can hold this up: then it is left to a thread that dies
-    with the process."""
+    """End a stream; return True if that took at most `seconds`. A hanging viewer can block it: then a daemon thread
+    keeps waiting."""
     thread = threading.Thread(target=stream.disconnect, name="rerun-disconnect", daemon=True)
     thread.start()
     thread.join(seconds)
@@ -204,13 +204,13 @@ def disconnect(stream: rr.RecordingStream, seconds: float) -> bool:
 
 def _shaped(shape: Callable[..., rr.AsComponents], fields: dict[str, Any]) -> rr.AsComponents:
     if "colors" in fields:
-        # Of a list of three or four, Rerun could not tell whether they are one.
+        # Rerun would read a list of three or four numbers as a single colour.
         fields = fields | {"colors": np.array(fields["colors"], np.uint32)}
     return shape(**fields)
 
 
 class HolderRow(NamedTuple):
-    """A request that holds a device; `operator` if its priority is an operator's; and the robots of its gang."""
+    """A request that holds a device; `operator` is True for an operator's priority; `robots` are those of its gang."""
 
     arc: str
     operator: bool = False
@@ -220,19 +220,18 @@ class HolderRow(NamedTuple):
 @dataclass(slots=True)
 class _Lane:
     colours: dict[str, int] = field(default_factory=dict)
-    """By text, the one longest unused first."""
+    """Colours by text, the least recently used first."""
     slots: list[str] = field(default_factory=list)
-    """What each row shows, "" where it is free."""
+    """The name in each row, empty for a free row."""
     rows: int = 0
-    """0: only its past is known."""
+    """0 if only its past is known."""
 
 
 class Lanes:
     """The lanes in one folder, at most `limit`; `others` ends the note that there are more.
 
-    `colours`: distinct texts of one lane that keep their colour; past it, the one longest unused loses it.
-    `depth`: parts of a name, with `/` between, that have parts of the entity of their own. `slots`: rows of a lane at
-    most."""
+    `colours`: texts of a lane that keep their colour; beyond it the least recently used loses its colour. `depth`:
+    parts of a name, separated by `/`, that become parts of the entity. `slots`: the most rows of a lane."""
 
     def __init__(
         self,
@@ -248,7 +247,7 @@ class Lanes:
         self._drawing, self._folder, self._limit, self._others = drawing, folder, limit, others
         self._colours, self._depth, self._slots = colours, depth, slots
         self._lanes: dict[str, _Lane] = {}
-        """By entity: names that differ may be cleaned to the same."""
+        """By entity: different names may be cleaned to the same."""
 
     @property
     def rows(self) -> int:
@@ -256,25 +255,24 @@ class Lanes:
 
     @property
     def entities(self) -> dict[str, int]:
-        """Rows by entity; not of those of which only the past is known."""
+        """Rows by entity, without lanes of which only the past is known."""
         return {entity: lane.rows for entity, lane in self._lanes.items() if lane.rows}
 
     @property
     def only_past(self) -> tuple[str, ...]:
-        """Those."""
+        """Entities of which only the past is known."""
         return tuple(sorted(entity for entity, lane in self._lanes.items() if not lane.rows))
 
     def entity(self, name: str) -> str:
         return clean_path(self._folder, name, self._depth)
 
     def texts(self, name: str) -> Mapping[str, int] | None:
-        """The texts that have a colour in the lane of this name; None if there is no such lane."""
+        """The texts with a colour in the lane of this name; None if there is no such lane."""
         lane = self._lanes.get(clean_path(self._folder, name, self._depth))
         return None if lane is None else lane.colours
 
     def show(self, at: float, name: str, shown: Mapping[str, tuple[str, int]]) -> None:
-        """From `at` on, the lane of this name shows exactly these: text and RGBA by what they are about. Each
-        gets a row."""
+        """From `at` on, the lane shows exactly these: text and RGBA by the name of their subject. Each gets a row."""
         entity = clean_path(self._folder, name, self._depth)
         lane = self._lane(at, entity)
         if lane is None:
@@ -285,8 +283,7 @@ class Lanes:
         self._drawing.show(at, entity, rr.StateChange, state=[text for text, _ in rows])
 
     def past(self, name: str, changes: Sequence[tuple[float, Sequence[tuple[str, int]]]]) -> None:
-        """What the lane of this name showed before all else, by time: text and RGBA of each row, "" where it is
-        free."""
+        """Draw the past of a lane, by time: text and RGBA of each row, an empty text for a free row."""
         entity = clean_path(self._folder, name, self._depth)
         lane = self._lane(0.0, entity)
         if lane is None or not changes:
@@ -297,7 +294,7 @@ class Lanes:
         self._drawing.columns(entity, [at for at, _ in changes], column.partition([len(row) for row in texts]))
 
     def _lane(self, at: float, entity: str) -> _Lane | None:
-        """None where there are too many."""
+        """The lane of an entity; None if there are too many."""
         if entity not in self._lanes:
             if not self._drawing.room(at, self._lanes, self._limit, self._others):
                 return None
@@ -311,7 +308,7 @@ class Lanes:
             self._drawing.log(None, entity, rr.StateConfiguration(values=list(lane.colours), colors=colours))
 
     def _learn(self, lane: _Lane, text: str, colour: int) -> bool:
-        """Whether the colour is new to the viewer."""
+        """Set a text's colour; return True if it is new to the viewer."""
         known = lane.colours.pop(text, None)
         lane.colours[text] = colour
         if len(lane.colours) > self._colours:
@@ -320,7 +317,7 @@ class Lanes:
 
 
 def _seat(lane: _Lane, names: Iterable[str], most: int) -> list[str]:
-    """Names by row. What stays keeps its row, so that no bar jumps; no row is taken away."""
+    """Names by row. Bars that stay keep their row, and the number of rows never decreases."""
     wanted = dict.fromkeys(names)
     crowded = len(wanted) > most
     rows = most - 1 if crowded else most
@@ -337,24 +334,24 @@ def _seat(lane: _Lane, names: Iterable[str], most: int) -> list[str]:
 
 
 def clean_path(folder: str, name: str, depth: int = 4) -> str:
-    """The entity of something with this name, which may have up to `depth` parts with `/` between."""
+    """The entity of a name with up to `depth` parts separated by `/`."""
     parts = (re.sub(r"[^A-Za-z0-9_.-]", "_", part)[:64] for part in name.split("/")[:depth])
     return f"/{folder}/{'/'.join(part or '_' for part in parts)}"
 
 
 def with_person(name: str, who: Who | None) -> str:
-    """A request as people know it: `survey (alice)`."""
+    """A request's name with its person: `survey (alice)`."""
     if who is None or not (who.user or who.host) or who.command.startswith(COMPONENT):
         return name
     return f"{name} ({clean(who.user or who.host)})"
 
 
 def with_detail(word: str, detail: str) -> str:
-    """The text of a bar; none without a word."""
+    """The text of a bar; empty without a word."""
     return clean_text(f"{word} · {detail}" if word and detail else word)
 
 
 def clean_text(text: str, limit: int = MAX_STATE) -> str:
-    """One line of at most `limit` characters, of letters that the viewer has: one that it lacks ends it."""
+    """One line of at most `limit` characters; those missing in the viewer's font, which would end it, are replaced."""
     line = _UNKNOWN.sub("?", " ".join(clean(text[: 2 * limit]).split()))
     return line if len(line) <= limit else line[: limit - 1] + "…"

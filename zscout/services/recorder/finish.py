@@ -1,8 +1,7 @@
-"""What becomes of a recording once it is over: few large chunks in place of one for each moment, old pictures thinned.
+"""Finishes a recording: rewrites it in few large chunks, and thins old pictures.
 
-A viewer takes its time for each chunk, whatever is in it, and a recorder writes thousands. As a program,
-`python -m zscout.services.recorder.finish`, it reads a job from standard input: the memory that this takes is not the
-recorder's for ever."""
+A viewer needs time for each chunk, whatever its size, and a recorder writes thousands. As a program,
+`python -m zscout.services.recorder.finish` reads a job from standard input: its memory is freed when it exits."""
 
 from __future__ import annotations
 
@@ -21,9 +20,9 @@ from rerun.chunk import Chunk, OptimizationProfile, RrdReader
 from zscout.services.recorder.blueprint import APPLICATION, Layout, blueprint
 
 WHOLE: Final = 600.0
-"""Seconds at the end of a recording in which every picture stays."""
+"""Seconds at the end of a recording whose pictures are all kept."""
 APART: Final = 1.0
-"""Seconds between two pictures of one camera that stay of what is older."""
+"""Seconds between the older pictures of a camera that are kept."""
 PICTURE: Final = "EncodedImage:blob"
 PROFILE: Final = OptimizationProfile(
     max_bytes=2 << 20, max_rows=65_536, max_rows_if_unsorted=65_536, extra_passes=50, gop_batching=False
@@ -32,17 +31,17 @@ WRITE_SECONDS: Final = 30.0
 
 
 class Job(msgspec.Struct, frozen=True):
-    """A recording that is over, and how it is laid out."""
+    """A complete recording, and its layout."""
 
     path: Path
     layout: Layout
 
 
 def finish(path: Path, layout: Layout, *, whole: float = WHOLE) -> None:
-    """Writes a recording anew, in place. Raises OSError, RuntimeError or ValueError where that can't be done: the file
-    is then as it was."""
+    """Rewrite a recording in place. On failure raises OSError, RuntimeError or ValueError, and leaves the file as it
+    was."""
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # what was written live has no footer
+        warnings.simplefilter("ignore")  # a live recording has no footer
         reader = RrdReader(path)
         store = reader.recordings()[0]
     end = layout.span[1] if layout.span is not None else 0.0
@@ -67,7 +66,7 @@ def finish(path: Path, layout: Layout, *, whole: float = WHOLE) -> None:
 
 
 def _thinned(before: float) -> Callable[[Chunk], Iterator[Chunk]]:
-    """Leaves out pictures older than `before`, in nanoseconds of the timeline, that follow another closely."""
+    """Leave out pictures older than `before` (ns of the timeline) within APART seconds of the last picture kept."""
     last: dict[str, int] = {}
 
     def thin(chunk: Chunk) -> Iterator[Chunk]:
@@ -92,12 +91,12 @@ def _thinned(before: float) -> Callable[[Chunk], Iterator[Chunk]]:
 
 
 def main() -> None:
-    """Exit code 1, and a line, where it could not be done."""
+    """Exit with code 1 and an error line on failure."""
     job = msgspec.json.decode(sys.stdin.buffer.read(), type=Job, dec_hook=lambda kind, value: kind(value))
     try:
         finish(job.path, job.layout)
     except (OSError, RuntimeError, ValueError) as error:
-        sys.exit(f"{job.path} can't be written anew, and stays as it is: {error}")
+        sys.exit(f"{job.path} can't be rewritten, and stays as it is: {error}")
 
 
 if __name__ == "__main__":

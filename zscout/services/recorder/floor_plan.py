@@ -1,5 +1,5 @@
-"""The floor's part of the timeline: a building's plan, who is where in it, and where robots came from, drawn in pixels
-of the plan's picture."""
+"""The floor's part of the timeline: a building's plan with robots, people and trails, in pixels of the plan's
+picture."""
 
 from __future__ import annotations
 
@@ -19,40 +19,40 @@ from zscout.services.recorder.drawing import Drawing, clean_text
 
 MIN_METRES: Final = 0.5
 MAX_METRES: Final = 200.0
-"""Of a building's width and depth."""
+"""Limit of a building's width and depth."""
 MAX_SIDE: Final = 4_096
 """Pixels of the plan's longer side."""
 MARGIN: Final = 0.1
-"""Part of a building's size by which something may stand outside and still be drawn."""
+"""Share of a building's size within which objects outside are still drawn."""
 TRAIL: Final = 60.0
-"""Seconds for which a robot's way is shown."""
+"""Seconds of a robot's trail."""
 TRAIL_STEP: Final = 0.5
-"""Seconds between two points of it."""
+"""Seconds between two points of a trail."""
 MOVED: Final = 0.02
-"""Metres; who moved less stands still."""
+"""Metres of movement that add a point to a trail."""
 IN_FULL: Final = 12
-"""Robots up to which each has its doing beside its name."""
+"""Up to so many robots have their activity beside their names."""
 MAX_NAME: Final = 24
-"""Characters of a name on floor and pictures."""
+"""Characters of a name on the floor and on pictures."""
 MAX_OTHERS: Final = 2_000
 POSE_SPACING: Final = 0.09
-"""Seconds between two records of where all are."""
+"""Seconds between two records of positions."""
 SILENCE: Final = 10.0
-"""Seconds without a message from a building after which it is not known who is where, and another may be shown."""
+"""Seconds without a message from a building after which positions are unknown, and another building may be shown."""
 PLAN_AGAIN: Final = 5.0
-"""Seconds until a plan that did not come is asked for again."""
+"""Seconds until the query for a plan is repeated."""
 MAX_TRAILS: Final = 256
 ARROW: Final = 0.055
-"""Length of a heading's arrow, as part of the building's longer side."""
+"""Length of a heading's arrow, as a share of the plan's longer side."""
 SIGHT: Final = 0.13
-"""Likewise, of a camera's field of view."""
+"""Length of a camera's field of view, as a share of the longer side."""
 VIEW: Final = math.radians(65)
-"""A Scout's camera sees this wide."""
+"""Angle of view of a Scout's camera."""
 WIDE: Final = 0.2
 LINE: Final = 0.055
-"""Room that a name takes, likewise."""
+"""Width and height of a name, as shares of the longer side."""
 MAX_STACK: Final = 6
-"""Names that give way to each other in one place."""
+"""Names in one place that avoid each other."""
 RING: Final = 24
 """Corners of a circle."""
 
@@ -60,15 +60,15 @@ Spot = tuple[float, float]
 
 
 class Layer(NamedTuple):
-    """How one kind of thing on the plan is drawn."""
+    """The style of one kind of object on the plan."""
 
     shape: Callable[..., rr.AsComponents]
     field: str
-    """Of the shape: where it is."""
+    """The shape's field with the positions."""
     radius: float
-    """Below 0: in points of the screen, whatever the zoom."""
+    """If negative, in points of the screen, independent of the zoom."""
     order: float | None = None
-    """A layer of a higher one covers it."""
+    """Layers of a higher order cover it."""
 
 
 LAYERS: Final = {
@@ -85,8 +85,8 @@ LAYERS: Final = {
 
 
 class Look(NamedTuple):
-    """How a robot is drawn beside where it is: what it does in words, and its colour (RGBA) where its being
-    hidden or not does not decide it."""
+    """The appearance of a robot: its activity, and its colour (RGBA), None for the colour of a hidden or visible
+    robot."""
 
     words: str = ""
     colour: int | None = None
@@ -98,7 +98,7 @@ class _Building:
     sender: Sender
     seen_at: float
     time: float = 0.0
-    """Its own."""
+    """The building's own time."""
     asked: float = -PLAN_AGAIN
     name: str = ""
     planned: bool = False
@@ -106,15 +106,15 @@ class _Building:
 
 
 class FloorPlan:
-    """One building at a time; `look` says of a robot's name how that robot is drawn."""
+    """Draws one building at a time; `look` returns the appearance of a robot by its name."""
 
     def __init__(self, drawing: Drawing, look: Callable[[str], Look]) -> None:
         self._drawing, self._look = drawing, look
         self.size: tuple[int, int] | None = None
-        """Of the plan's picture, in pixels; None before there is one."""
+        """Size of the plan's picture in pixels; None before there is a plan."""
         self._metres = (1.0, 1.0)
         self._trails: dict[str, deque[tuple[float, Spot]]] = {}
-        """Seconds and place, by robot."""
+        """Times and places, by robot."""
         self._building: _Building | None = None
         self._others: set[Sender] = set()
 
@@ -123,10 +123,10 @@ class FloorPlan:
         if building is not None and building.sender != sender and at - building.seen_at <= SILENCE:
             if sender not in self._others and len(self._others) < MAX_OTHERS:
                 self._others.add(sender)
-                self._drawing.warn(at, f"a second building, of {sender}, is not shown: that of {building.sender} is")
+                self._drawing.warn(at, f"a second building, of {sender}, is not shown beside that at {building.sender}")
             return
         if building is None or building.sender != sender or poses.time < building.time - 1:
-            # Its time goes back: it is another building that the same client simulates now.
+            # If time goes back, the same client simulates another building now.
             self._building = building = _Building(sender, at)
             self._others.discard(sender)
         elif building.planned and at - building.seen_at < POSE_SPACING:
@@ -142,10 +142,10 @@ class FloorPlan:
         if building is not None and building.planned and at - building.seen_at > SILENCE:
             building.planned = False
             self._clear(at)
-            self._drawing.warn(at, f"building {building.name} is silent: who is where is not known any more")
+            self._drawing.warn(at, f"building {building.name} is silent: positions are unknown")
 
     def wants_plan(self, at: float) -> Sender | None:
-        """The client to ask for its building's plan now, if any."""
+        """The client to query for its building's plan now, if any."""
         building = self._building
         if building is None or building.planned or building.refused:
             return None
@@ -174,35 +174,35 @@ class FloorPlan:
         building.planned = True
         self._clear(at)
         self.size, self._metres = size, (width, depth)
-        # For all times: a server that forgets its oldest data for want of memory must keep the plan.
+        # Static: a server that drops its oldest data must keep the plan.
         image = rr.EncodedImage(contents=plan.picture, media_type="image/png", draw_order=-20.0)
         self._drawing.log(None, "/floor/plan", image)
         self._drawing.arrange()
 
     def _clear(self, at: float) -> None:
-        """From `at` on, it is not known where anybody is; the plan stays."""
+        """From `at` on, positions are unknown; the plan stays."""
         for layer in LAYERS:
             self._draw(at, layer, [], [])
         self._trails.clear()
 
     def _show(self, at: float, poses: BuildingPoses, caption: str) -> None:
-        """Where all are from `at` on. Who is far outside is left out."""
-        robots = [one for one in poses.robots if self._is_near(one)]
-        people = [one for one in poses.people if self._is_near(one)]
-        looks = [self._look(one.name) for one in robots]
-        names = [clean_text(one.name, MAX_NAME) for one in robots]
-        spots = [self._pixel(one) for one in robots]
-        walkers = [self._pixel(one) for one in people]
+        """Draw all positions from `at` on, except those far outside."""
+        robots = [robot for robot in poses.robots if self._is_near(robot)]
+        people = [person for person in poses.people if self._is_near(person)]
+        looks = [self._look(robot.name) for robot in robots]
+        names = [clean_text(robot.name, MAX_NAME) for robot in robots]
+        spots = [self._pixel(robot) for robot in robots]
+        walkers = [self._pixel(person) for person in people]
         shades = [
-            look.colour or (HIDDEN if one.hidden else IN_THE_OPEN) for one, look in zip(robots, looks, strict=True)
+            look.colour or (HIDDEN if robot.hidden else IN_THE_OPEN) for robot, look in zip(robots, looks, strict=True)
         ]
         self._draw_trails(at, names, spots, shades)
         self._draw(at, "robots", spots, shades)
-        self._draw(at, "headings", [self._vector(one.heading, ARROW) for one in robots], shades, origins=spots)
+        self._draw(at, "headings", [self._vector(robot.heading, ARROW) for robot in robots], shades, origins=spots)
         seen = [
-            [spot, *(self._beside(spot, one.heading + turn * VIEW / 8, SIGHT) for turn in range(-4, 5)), spot]
-            for one, spot in zip(robots, spots, strict=True)
-            if one.camera
+            [spot, *(self._beside(spot, robot.heading + turn * VIEW / 8, SIGHT) for turn in range(-4, 5)), spot]
+            for robot, spot in zip(robots, spots, strict=True)
+            if robot.camera
         ]
         self._draw(at, "views", seen, [faded(CAMERA, 0.8)])
         rings = [
@@ -212,10 +212,10 @@ class FloorPlan:
         ]
         self._draw(at, "alerts", rings, [ALERT])
         self._draw(at, "people", walkers, [PERSON])
-        # Names stand apart from the points: a text must be brighter.
+        # Names are separate from the points: a text must be brighter.
         if len(robots) <= IN_FULL:
             names = [f"{name} · {look.words}" if look.words else name for name, look in zip(names, looks, strict=True)]
-        texts = [*map(clean_text, names), *(clean_text(one.name, MAX_NAME) for one in people)]
+        texts = [*map(clean_text, names), *(clean_text(person.name, MAX_NAME) for person in people)]
         colours = [bright(colour) for colour in (*shades, *(PERSON for _ in people))]
         places = self._places([*spots, *walkers])
         self._draw(at, "names", places, colours, labels=texts, show_labels=True)
@@ -228,7 +228,7 @@ class FloorPlan:
         self._drawing.show(at, f"/floor/{layer}", shape, **fields, **more)
 
     def _places(self, spots: Sequence[Spot]) -> list[Spot]:
-        """Where names stand: each gives way to one that it would cover."""
+        """Positions of names, moved down where they would cover another."""
         longer = max(self.size or (1, 1))
         wide, line = WIDE * longer, LINE * longer
         places: list[Spot] = []
@@ -260,14 +260,16 @@ class FloorPlan:
 
     # From metres to pixels
 
-    def _is_near(self, one: Placed) -> bool:
+    def _is_near(self, placed: Placed) -> bool:
         width, depth = self._metres
-        return -MARGIN * width <= one.x <= (1 + MARGIN) * width and -MARGIN * depth <= one.y <= (1 + MARGIN) * depth
+        return (
+            -MARGIN * width <= placed.x <= (1 + MARGIN) * width and -MARGIN * depth <= placed.y <= (1 + MARGIN) * depth
+        )
 
-    def _pixel(self, one: Placed) -> Spot:
-        """The plan's rows begin at the largest y."""
+    def _pixel(self, placed: Placed) -> Spot:
+        """Convert metres to pixels: the plan's rows begin at the largest y."""
         (width, height), (metres_x, metres_y) = self.size or (1, 1), self._metres
-        return round(one.x * width / metres_x, 1), round((metres_y - one.y) * height / metres_y, 1)
+        return round(placed.x * width / metres_x, 1), round((metres_y - placed.y) * height / metres_y, 1)
 
     def _vector(self, heading: float, part: float) -> Spot:
         length = part * max(self.size or (1, 1))

@@ -1,5 +1,5 @@
-"""The hosts' part of the timeline: load curves with marks on them, what runs where as the placer publishes
-it, and what it uses. Times are passed in."""
+"""The hosts' part of the timeline: load curves with marks, placements of components, and their resource use. Times are
+passed in."""
 
 from __future__ import annotations
 
@@ -20,25 +20,25 @@ from zscout.types import NO_TERM, Term
 log = logging.getLogger(__name__)
 
 MAX_FOLLOWED: Final = 2 * MAX_PLACED
-"""Components."""
+"""Components followed at one time."""
 MAX_HOSTS: Final = 256
 MAX_CURVES: Final = 32
-"""Components whose use is drawn at one time: the heaviest."""
+"""Components whose use is drawn at one time, the heaviest."""
 MAX_DRAWN: Final = 256
-"""Components that ever have curves, in one recording."""
+"""Components with curves at any time of one recording."""
 HEAVIER: Final = 1.5
-"""By this factor a component must be heavier than one that has curves to take its place."""
+"""Factor by which a component must be heavier than the lightest with curves to replace it."""
 GIGABYTE: Final = 1e9
-"""Bytes that weigh as much as one core."""
+"""Bytes that count as much as one core."""
 SMOOTHING: Final = 0.1
-"""Part of a component's weight that is its last report's."""
+"""Share of the last report in a component's weight."""
 SAME_MOMENT: Final = 1.0
-"""Marks of one host within so many seconds stand above each other."""
+"""Marks of one host within so many seconds are stacked."""
 MAX_STACK: Final = 10
 SEATED: Final = {"starting": "starting", "running": "", "moving": "moves", "stopping": "stopping"}
-"""States of a component that has a host, and what it does there."""
+"""States of a component with a host, and their texts."""
 GETS_READY: Final = "gets ready"
-"""A component on the host to which it moves."""
+"""Text of a component on the host to which it moves."""
 SILENCE: Final = 10.0
 """Seconds without a report after which a load curve is interrupted."""
 
@@ -47,7 +47,7 @@ Mark: TypeAlias = Literal["placed", "restarted", "left", "came", "given_up"]
 
 @dataclass(slots=True)
 class _Component:
-    """A component that is followed: its newest placement, and which start of it ran last, where."""
+    """A component: its newest placement, with the incarnation and the host that ran last."""
 
     placement: Placement
     ran: int = 0
@@ -57,13 +57,13 @@ class _Component:
 @dataclass(slots=True)
 class _Host:
     reported: float
-    """When its load was."""
+    """Time of the last load report."""
     load: float = 0.0
 
 
 @dataclass(slots=True)
 class _Marked:
-    """A host's latest marks: since when, how many, and how high they began."""
+    """The latest stack of marks of a host: time, number, and height of the first."""
 
     at: float
     count: int
@@ -71,31 +71,30 @@ class _Marked:
 
 
 class HostTracker:
-    """Draws hosts and components; `colour` gives a component its RGBA."""
+    """Draws hosts and components; `colour` returns the RGBA of a component."""
 
     def __init__(self, drawing: Drawing, colour: Callable[[str], int]) -> None:
         self._drawing, self._colour = drawing, colour
-        self.lanes = Lanes(drawing, "host", MAX_HOSTS, "hosts: what runs on the others is not shown")
+        self.lanes = Lanes(drawing, "host", MAX_HOSTS, "hosts: components of the others are not shown")
         self.placing = False
-        """There are components, if only none now: a fleet without them has no use for empty panes."""
+        """True once there were components: without any, their panes are left out."""
         self._hosts: dict[str, _Host] = {}
         self._peak = 1.0
         self._marked: dict[str, _Marked] = {}
         self._looks: set[Mark] = set()
         self._curves: dict[tuple[str, str], float] = {}
-        """Weight of each component that has curves now, by host and component."""
+        """Weight of each component with curves, by host and component."""
         self._drawn: set[tuple[str, str]] = set()
         self._term: Term = NO_TERM
         self._components: dict[str, _Component] = {}
-        """The one that changed longest ago first."""
+        """Components, the least recently changed first."""
         self._cordoned: frozenset[str] = frozenset()
 
     # Loads and marks
 
     def load(self, at: float, host: str, load1: float, cpu: float | None = None) -> None:
-        """A host's load average over 1 minute and, kept under `/cpu`, its CPU use (0 to 1).
-
-        What is not a finite number leaves a gap."""
+        """Draw a host's load average over 1 minute and, under `/cpu`, its CPU use (0 to 1). Values that are not finite
+        leave a gap."""
         entities = clean_path("load", host), clean_path("cpu", host)
         known = self._hosts.get(host)
         if known is None:
@@ -105,7 +104,7 @@ class HostTracker:
                 self._drawing.curve(entity, host, LINES[len(self._hosts) % len(LINES)], 2.0)
             known = self._hosts[host] = _Host(at)
         if at - known.reported > SILENCE:
-            # What the load was meanwhile is not known: no line is drawn through that time.
+            # The load in between is unknown: interrupt the line.
             for entity in entities:
                 self._drawing.erase(known.reported + SILENCE, entity)
         known.reported = at
@@ -116,12 +115,12 @@ class HostTracker:
             known.load, self._peak = load1, max(self._peak, load1)
 
     def mark(self, at: float, host: str, mark: Mark, component: str) -> None:
-        """Marks on the host's load curve what happened to a component there."""
+        """Mark an event of a component on the host's load curve."""
         entity = f"/mark/{mark}"
         if mark not in self._looks:
             self._looks.add(mark)
             colour, marker = MARKS[mark]
-            # Those of one name have one line in the legend.
+            # Marks with the same name share a line of the legend.
             look = rr.SeriesPoints(names=["components"], colors=[colour], markers=[marker], marker_sizes=[7.0])
             self._drawing.log(None, entity, look)
         stack = self._marked.get(host)
@@ -136,7 +135,7 @@ class HostTracker:
         self._drawing.log(at, entity, rr.Scalars(height), words)
 
     def uses(self, at: float, host: str, uses: Iterable[ComponentUse]) -> None:
-        """What all components of a host use; the curve of one that is not named ends."""
+        """Draw the use of all components of a host; end the curves of others."""
         known = {use.component: use for use in uses}
         for key in [key for key in self._curves if key[0] == host and key[1] not in known]:
             self._end_curve(at, key)
@@ -151,8 +150,8 @@ class HostTracker:
                 self._drawing.point(at, entity, value)
 
     def _make_room(self, at: float, key: tuple[str, str], weight: float) -> bool:
-        """Whether a component may have curves from now on."""
-        others = "components had curves: what others use is not drawn"
+        """Return True if a component may have curves from now on."""
+        others = "components had curves: the use of the others is not drawn"
         if key not in self._drawn and not self._drawing.room(at, self._drawn, MAX_DRAWN, others):
             return False
         if len(self._curves) >= MAX_CURVES:
@@ -172,11 +171,12 @@ class HostTracker:
         for entity in _entities(key):
             self._drawing.erase(at, entity)
 
-    # What runs where
+    # Placements
 
     def placements(self, at: float, news: Placements, fresher: set[str] | None = None) -> None:
-        """What has changed; with `fresher`, which names what was published since the question and is known better, all
-        there is: what was not known before is shown then, but did not happen now."""
+        """Take changed placements; with `fresher`, the answer to a query for all. `fresher` names components published
+        since that query, which are ignored in the answer. New components in an answer are shown, but did not happen
+        now."""
         if news.term < self._term or absurd(news.term, self._term):
             return
         self._term = news.term
@@ -200,7 +200,7 @@ class HostTracker:
             self._drawing.event(at, f"{host} is used again")
 
     def _show_lane(self, at: float, host: str) -> None:
-        """Each component on the host gets a row."""
+        """Show a row for each component on the host."""
         self.placing = True
         self._drawing.arrange()
         shown = dict[str, tuple[str, int]]()
@@ -212,7 +212,7 @@ class HostTracker:
         self.lanes.show(at, host, shown)
 
     def _take(self, at: float, now: Placement, *, news: bool) -> set[str]:
-        """Takes a component in; returns the hosts whose lanes are another."""
+        """Take a placement; return the hosts whose lanes change."""
         names = (now.component, *(host for host in (now.host, now.to) if host is not None))
         if not all(NAME.fullmatch(name) for name in names):
             log.warning("the placer published a component or host with a bad name: %.200r", names)
@@ -230,7 +230,7 @@ class HostTracker:
         return {*_seats(now), *(_seats(before) if before is not None else ())}
 
     def _log_change(self, at: float, known: _Component, before: Placement | None, *, news: bool) -> None:
-        """The event, and the marks, if any."""
+        """Log the event of a change, and its marks."""
         now, name = known.placement, known.placement.component
         event, warn, mark = self._drawing.event, self._drawing.warn, self.mark
         why = f": {now.reason}" if now.reason else ""
@@ -272,7 +272,7 @@ class HostTracker:
 
 
 def _seats(placement: Placement) -> dict[str, str]:
-    """In which hosts' lanes a component stands, and what it does there: empty while it just runs."""
+    """By host: the text of a component in the host's lane, empty while it simply runs."""
     host, to = placement.host, placement.to
     if host is None or placement.state not in SEATED:
         return {}

@@ -1,5 +1,5 @@
-"""What RCs showed before a recording began, as journals tell: pure. Seconds since 1970 come in, seconds of the timeline
-go out."""
+"""Lanes of RCs before the start of a recording, from journals. Pure. Input is in seconds since 1970, output in seconds
+of the timeline."""
 
 from __future__ import annotations
 
@@ -15,54 +15,53 @@ from zscout.services.journal.merging import Span, apart, both
 from zscout.services.recorder.drawing import MAX_SLOTS, with_person
 
 MAX_LANES: Final = 500
-"""RCs whose past is drawn: those that were held last."""
+"""RCs whose past is drawn: the most recently held."""
 MAX_GAPS: Final = 20
-"""Times of which not all is known that are told of in words: the latest."""
+"""Incomplete periods that become events: the latest."""
 MAX_NAMED: Final = 8
-"""Hosts in one line."""
+"""Hosts named in one line."""
 
 
 class PastBar(NamedTuple):
-    """An ARC that held an RC; without a name nobody knows who did."""
+    """An ARC that held an RC; without a name it is unknown whether any did."""
 
     arc: str = ""
     operator: bool = False
 
 
 PastLane: TypeAlias = Sequence[tuple[float, Sequence[PastBar | None]]]
-"""By time, what each row shows from then on; None: nothing."""
+"""By time, the bar of each row from then on; None: no bar."""
 
 
 class Past(NamedTuple):
-    """What there is to draw of it, and to say: what it is, and of when nobody knows all."""
+    """The past to draw, with events that describe it and its gaps."""
 
     lanes: Mapping[str, PastLane]
     words: Sequence[str]
     gaps: Sequence[str]
 
 
-def past_of(told: FleetHistory, zero: float, seconds: float, operator_priority: int) -> Past:
-    """What journals tell of so many seconds before `zero`, which is second 0. Nothing is said of when no journal was
-    kept yet."""
-    known = min((one.since for one in told.journals.values() if one.since is not None), default=zero)
-    began = max(zero - seconds, known, told.holds[0].began if told.more else 0.0)
+def past_of(history: FleetHistory, zero: float, seconds: float, operator_priority: int) -> Past:
+    """The past of `seconds` before `zero`, which is second 0. Starts no earlier than the oldest journal."""
+    known = min((journal.since for journal in history.journals.values() if journal.since is not None), default=zero)
+    began = max(zero - seconds, known, history.holds[0].began if history.more else 0.0)
     window = Span(min(began, zero), zero)
-    unknown = [Span(max(one.began, window.began), min(one.ended, zero)) for one in told.unknown]
-    unknown = [one for one in unknown if one.ended > one.began]
-    hours, journals = f"{seconds / 3600:.3g} h", f"of {', '.join(sorted(told.journals)[:MAX_NAMED])}"
+    unknown = [Span(max(span.began, window.began), min(span.ended, zero)) for span in history.unknown]
+    unknown = [span for span in unknown if span.ended > span.began]
+    hours, journals = f"{seconds / 3600:.3g} h", f"of {', '.join(sorted(history.journals)[:MAX_NAMED])}"
     words = []
-    if told.holds:
-        count = "1 hold" if len(told.holds) == 1 else f"{len(told.holds)} holds"
-        count = f"the latest {count}" if told.more else count
-        words = [f"the journals {journals} tell of {count} in the {hours} before this recording"]
-    if told.without:
-        words.append(f"no journal of {', '.join(told.without[:MAX_NAMED])}: off, older than 0.3.0, or too slow")
+    if history.holds:
+        count = "1 hold" if len(history.holds) == 1 else f"{len(history.holds)} holds"
+        count = f"the latest {count}" if history.more else count
+        words = [f"the journals {journals} list {count} in the {hours} before this recording"]
+    if history.without:
+        words.append(f"no journal of {', '.join(history.without[:MAX_NAMED])}: off, older than 0.3.0, or too slow")
     gaps = [
-        f"from {_at(one.began)} to {_at(one.ended)} UTC the journals are incomplete: {told.causes(one)}"
-        for one in unknown
+        f"from {_at(span.began)} to {_at(span.ended)} UTC the journals are incomplete: {history.causes(span)}"
+        for span in unknown
     ]
     more = [f"and {len(gaps) - MAX_GAPS} more such times before"] if len(gaps) > MAX_GAPS else []
-    return Past(past_lanes(told.holds, unknown, window, zero, operator_priority), words, [*gaps[-MAX_GAPS:], *more])
+    return Past(past_lanes(history.holds, unknown, window, zero, operator_priority), words, [*gaps[-MAX_GAPS:], *more])
 
 
 def _at(seconds: float) -> str:
@@ -72,8 +71,8 @@ def _at(seconds: float) -> str:
 def past_lanes(
     holds: Iterable[PastHold], unknown: Sequence[Span], window: Span, zero: float, operator_priority: int
 ) -> Mapping[str, PastLane]:
-    """By RC, what its lane shows within the window, and nothing after it. `unknown`: times of which no journal knows
-    all, in order and apart; there an RC of which no hold is known is not known to be free. Second 0 is `zero`."""
+    """The lane of each RC within the window. `unknown`: periods that no journal covers completely, sorted and disjoint,
+    in which an RC without a known hold is not known to be free. Second 0 is `zero`."""
     bars: dict[str, list[tuple[Span, PastBar]]] = {}
     for hold in holds:
         span = Span(
@@ -87,12 +86,12 @@ def past_lanes(
 
 
 def _lane(bars: Sequence[tuple[Span, PastBar]], unknown: Sequence[Span], zero: float) -> PastLane:
-    """Bars at one time stand one below the other, MAX_SLOTS at most."""
+    """Simultaneous bars have a row each, at most MAX_SLOTS."""
     ends: list[float] = []
     changes: list[tuple[float, bool, int, PastBar | None]] = []
 
     def add(span: Span, row: int, bar: PastBar) -> None:
-        # What ends is before what begins then.
+        # At one instant ends come before starts.
         changes.extend([(span.began, True, row, bar), (span.ended, False, row, None)])
 
     for span, bar in bars:
@@ -116,7 +115,7 @@ def _lane(bars: Sequence[tuple[Span, PastBar]], unknown: Sequence[Span], zero: f
 
 
 def _free(unknown: Sequence[Span], held: Iterable[Span]) -> list[Span]:
-    """What is left of times, in order and apart, where nothing is held."""
+    """The parts of `unknown` in which no hold is known; all spans are sorted and disjoint."""
     busy = apart(held)
     begins, ends = [-math.inf, *(span.ended for span in busy)], [*(span.began for span in busy), math.inf]
     return both(unknown, [Span(*between) for between in zip(begins, ends, strict=True)])

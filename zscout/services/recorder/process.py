@@ -1,7 +1,7 @@
-"""What surrounds a recorder: its process, its job, and the folder of its recordings.
+"""Management of a recorder: its process, its job, and the folder of its recordings.
 
-It is a process of its own, as Rerun is large and a node should stay small. Recordings are files named by fleet and
-local time, of which the newest are kept."""
+The recorder is a separate process, as Rerun is large and a node should stay small. Recordings are files named by fleet
+and local time; the newest are kept."""
 
 from __future__ import annotations
 
@@ -28,49 +28,49 @@ from zscout.mesh.supervision import done_within
 log = logging.getLogger(__name__)
 
 RESTARTS: Final = 5
-"""Failures in a row, after which the recorder is given up."""
+"""Failures in a row after which the recorder is not restarted."""
 PAUSE: Final = 1.0
 LONG_ENOUGH: Final = 60.0
-"""A recorder that ran for this many seconds is no failure in a row any more."""
+"""Seconds of running after which failures count from one again."""
 GRACE: Final = 40.0
 """Seconds for the recorder to finish its file."""
 QUIET: Final = {"RUST_LOG": "error"}
-"""Rerun would warn of each file that is to have no footer before it is finished."""
+"""Rerun would warn about each file without a footer, which a file gets only when it is finished."""
 BAD_SETTINGS: Final = 2
-"""Its exit code where trying again would not help."""
+"""Exit code for an error that a restart would not fix."""
 KEEP: Final = 500
 """Recordings of one fleet in one folder; older ones are removed."""
 MEGABYTE: Final = 1_000_000
 HALF_DONE: Final = 3_600.0
-"""Seconds after which what was to become a finished recording is a leftover."""
+"""Seconds after which the unfinished output of `finish` is a leftover."""
 MAX_A_SECOND: Final = 100
 
 
 class RecorderJob(msgspec.Struct, frozen=True):
-    """What a recorder reads from its standard input, as one line of JSON. `recorder.port` 0: any free one."""
+    """Standard input of a recorder, as one line of JSON. `recorder.port` 0: any free port."""
 
     recorder: RecorderConfig
     fleet: Fleet
     host: str
     joined: bool = True
-    """Whether others may look at what it records: not at what ends with somebody's view."""
+    """Answer other programs that ask for the recording; False for one that ends with a view."""
 
 
 class Recording(msgspec.Struct, frozen=True):
-    """What a recorder writes to its standard output, as one line of JSON, once it records."""
+    """Standard output of a recorder once it records, as one line of JSON."""
 
     file: str
     url: str | None = None
-    """Where a viewer finds it live."""
+    """Address of the live view."""
 
 
 class RecorderReport(msgspec.Struct, frozen=True, omit_defaults=True):
-    """Any such line: a Recording, or later whether that can be written."""
+    """Any line of standard output: a Recording, or later a change of `fault`."""
 
     file: str = ""
     url: str | None = None
     fault: str = ""
-    """Why it can't be written; empty: it can."""
+    """Why the file can't be written; empty if it can."""
 
 
 def encode_job(job: RecorderJob) -> bytes:
@@ -86,7 +86,7 @@ def decode_job(line: bytes) -> RecorderJob:
 
 
 def new_recording(folder: Path, fleet: str) -> Path:
-    """Makes an empty `<fleet>-<date>-<time>.rrd` in `folder`, and the folder too. Raises BadInput."""
+    """Make an empty file `<fleet>-<date>-<time>.rrd` in `folder`, which is made too. Raises BadInput."""
     stem = f"{fleet}-{time.strftime('%Y%m%d-%H%M%S')}"
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -103,17 +103,15 @@ def new_recording(folder: Path, fleet: str) -> Path:
 
 @contextmanager
 def writing(path: Path) -> Iterator[None]:
-    """No other recorder removes the file meanwhile."""
+    """Protect the file from removal by other recorders."""
     with path.open("ab") as file:
         fcntl.flock(file, fcntl.LOCK_SH)
         yield
 
 
 def prune(folder: Path, fleet: str, keep: int = KEEP, limit: int | None = None) -> None:
-    """Removes the oldest recordings of a fleet, until at most `keep` are left, of `limit` bytes in all; but none that
-    is being written.
-
-    Nothing is touched that is not named as `new_recording` names files."""
+    """Remove the oldest recordings of a fleet until at most `keep` are left, with `limit` bytes in total. Recordings
+    being written are kept. Only files named as by `new_recording` are removed."""
     name = rf"{re.escape(fleet)}-\d{{8}}-\d{{6}}(-\d+)?"
     ours, half_done = re.compile(rf"{name}\.rrd"), re.compile(rf"\.{name}\.finishing")
     try:
@@ -123,7 +121,7 @@ def prune(folder: Path, fleet: str, keep: int = KEEP, limit: int | None = None) 
                 path.unlink()
         recordings = [(path, stat) for path, stat in found if ours.fullmatch(path.name)]
         size = 0
-        for number, (path, stat) in enumerate(sorted(recordings, key=lambda one: one[1].st_mtime_ns, reverse=True)):
+        for number, (path, stat) in enumerate(sorted(recordings, key=lambda found: found[1].st_mtime_ns, reverse=True)):
             size += stat.st_size
             if (number >= keep or (limit is not None and size > limit)) and not _is_written(path):
                 path.unlink()
@@ -142,21 +140,21 @@ def _is_written(path: Path) -> bool:
 
 
 class RecorderProcess:
-    """A child that records until its standard input closes: it can't outlive this process."""
+    """A child that records until its standard input closes, so that it can't outlive this process."""
 
     def __init__(self, recorder: RecorderConfig, fleet: Fleet, host: str) -> None:
         self._job = encode_job(RecorderJob(recorder, msgspec.structs.replace(fleet, mesh=beside(fleet.mesh)), host))
         self._child: asyncio.subprocess.Process | None = None
         self.fault = ""
-        """Why nothing is recorded; empty where it is."""
-        # A node goes on without its recorder: what fails here is logged.
+        """Why nothing is recorded; empty if it is."""
+        # A node continues without its recorder: failures are only logged.
         self._supervisor = Supervisor("the recorder's process", lambda _: None)
 
     async def start(self) -> None:
         self._supervisor.spawn(self._run())
 
     async def stop(self) -> None:
-        """Ends the recorder; returns when its file is finished, or GRACE is over."""
+        """Stop the recorder; return when its file is finished, or after GRACE seconds."""
         await self._supervisor.close()
         child = self._child
         if child is None or child.returncode is not None:
@@ -164,7 +162,7 @@ class RecorderProcess:
         if child.stdin is not None:
             child.stdin.close()
         if not await done_within(GRACE, child.wait()):
-            log.warning("the recorder did not finish in %g s and is killed", GRACE)
+            log.warning("the recorder did not finish in %g s: killing it", GRACE)
             child.kill()
             await child.wait()
 
@@ -179,17 +177,17 @@ class RecorderProcess:
                 code = 1
             if code in (0, BAD_SETTINGS):
                 words = "was ended" if code == 0 else "can't run with these settings"
-                log.warning("the recorder %s; this node goes on without it", words)
+                log.warning("the recorder %s; this node continues without it", words)
                 self.fault = self.fault or f"the recorder {words}; see the node's log"
                 return
             failures = 1 if time.monotonic() - began >= LONG_ENOUGH else failures + 1
             log.warning("the recorder ended with code %d", code)
             await asyncio.sleep(PAUSE)
-        log.error("the recorder failed %d times in a row and is given up; everything else goes on", RESTARTS)
+        log.error("the recorder failed %d times in a row and is not restarted; this node continues", RESTARTS)
         self.fault = self.fault or f"the recorder failed {RESTARTS} times in a row; see the node's log"
 
     async def _record(self) -> int:
-        """One life of the recorder; returns its exit code."""
+        """Run the recorder once; return its exit code."""
         child = self._child = await asyncio.create_subprocess_exec(
             sys.executable,
             *("-m", "zscout.services.recorder"),
@@ -200,12 +198,12 @@ class RecorderProcess:
         )
         assert child.stdin is not None  # noqa: S101
         assert child.stdout is not None  # noqa: S101
-        with suppress(ConnectionError, ValueError):  # it ended before that: the code says more
+        with suppress(ConnectionError, ValueError):  # the child has ended: its exit code has the cause
             child.stdin.write(self._job)
             await child.stdin.drain()
             while line := await child.stdout.readline():
                 report = msgspec.json.decode(line, type=RecorderReport)
                 self.fault = report.fault
                 if report.file:
-                    log.info("records to %s, live at %s", report.file, report.url)
+                    log.info("recording to %s, live at %s", report.file, report.url)
         return await child.wait()

@@ -1,10 +1,9 @@
-"""The recorder: what the mesh shows, written to the timeline.
+"""The recorder: writes the activity of the mesh to the timeline.
 
-It only subscribes. The holders of each RC come from what the RCM publishes; why an ARC waits, from the notices to its
-client; hosts and RCs that come and go, from liveliness; what runs on which host, from the component placer; what robots
-do and see, from behaviors, framegrabbers and buildings. `rcm/state` is read at the start and where something was
-missed, so that a recorder may begin in the middle of things. What was held before that, journals tell; what is booked,
-the leader, when it is asked."""
+It only subscribes and queries. Holders of RCs come from publications of the RCM, reasons to wait from notices to
+clients, the presence of hosts and RCs from liveliness tokens, components from the placer, and the activity of robots
+from behaviors, framegrabbers and buildings. `rcm/state` is read at the start and after missed publications, so that a
+recorder may start at any time. Earlier holds come from journals, and bookings from the leader."""
 
 from __future__ import annotations
 
@@ -33,33 +32,33 @@ log = logging.getLogger(__name__)
 
 READ_TIMEOUT: Final = 2.0
 PAUSE: Final = 0.1
-"""Seconds before a leader that did not answer is asked again."""
+"""Seconds before a leader that did not answer is queried again."""
 AGAIN: Final = 2.0
-"""Seconds until a placer, or journals, that did not answer are asked again."""
+"""Seconds until a placer, or journals, that did not answer are queried again."""
 BOOKINGS_EVERY: Final = 5.0
-"""Seconds from one question for bookings to the next."""
+"""Seconds between two queries for bookings."""
 MANY_BOOKINGS: Final = 100
-"""Bookings past which it is asked less often: so many more, so much longer."""
+"""Number of bookings beyond which the period grows in proportion."""
 MAX_PAST: Final = 5_000
-"""Holds of the time before the recording: the latest."""
+"""Holds drawn of the time before the recording: the latest."""
 COMMITTED: Final = 2.0
-"""Seconds until journals have what was heard before."""
+"""Seconds until journals have committed earlier publications."""
 TRIES: Final = 5
-"""Past it, it is asked when an RCM comes or something was missed."""
+"""Queries without an answer, after which the next query waits for a new RCM or a missed publication."""
 CHECK_EVERY: Final = 1.0
-"""Seconds between two checks whether anything was dropped here."""
+"""Seconds between two checks for publications dropped here."""
 DOUBT_EVERY: Final = 5.0
-"""Seconds between two readings of the state while it differs from the tokens on which devices are there."""
+"""Seconds between two readings of the state while it and the tokens differ on which devices are present."""
 BANNER_AFTER: Final = 2.0
 DEPTH: Final = 8_192
 ROBOT_DEPTH: Final = 1_024
-"""Publications of one kind that may wait here."""
+"""Publications of one kind that may wait."""
 CAMERAS: Final = "framegrabber/"
 CAMERA_FIGURE: Final = "frames_per_second"
 """Figure of a camera of another kind."""
 """RCs of this kind have pictures."""
 NO_PICTURE: Final = 3.0
-"""Seconds without a picture after which that is shown."""
+"""Seconds without a picture after which the recording shows that."""
 TICK: Final = 0.25
 MAX_REPORT: Final = 8_192
 MAX_POSES: Final = 65_536
@@ -70,7 +69,7 @@ PRESENCE: Final = {
     Role.RC: ("{name} is gone from {host}", "{name} is offered by {host}"),
     Role.CLIENT: ("client {host}/{name} left", "client {host}/{name} joined"),
 }
-"""By role: what is said when its token goes, and when it comes; not among the events."""
+"""By role: the texts when its token disappears and appears, listed apart from the events."""
 LEADS: Final = ("{host} does not lead any more", "{host} leads")
 
 
@@ -79,10 +78,10 @@ class RecorderFailed(RuntimeError):
 
 
 class Recorder:
-    """Follows one fleet and writes it to `timeline`, in seconds since this object was made.
+    """Records one fleet to `timeline`, in seconds since this object was created.
 
-    Of each camera at most `frames` pictures a second are shown, and with 0 none are subscribed to: then the
-    framegrabber sends none."""
+    At most `frames` pictures a second of each camera are recorded. With 0 there are no subscriptions to pictures, so
+    framegrabbers need not publish any."""
 
     def __init__(
         self,
@@ -94,8 +93,8 @@ class Recorder:
         past: float = 0.0,
         wall: Callable[[], float] = time.time,
     ) -> None:
-        """`where` answers who asks for the recording; without it nobody is answered. `past`: seconds before this object
-        was made of which journals are asked. `wall`: seconds since 1970, UTC."""
+        """`where` answers queries for the place of the recording; without it there are no answers. `past`: seconds
+        before this object was created, for which journals are queried. `wall`: seconds since 1970, UTC."""
         self.mesh, self.timeline, self.frames, self._where = mesh, timeline, frames, where
         self.fleet, self.past, self._wall = fleet, past, wall
         self._zero, self._epoch = mesh.now(), wall()
@@ -106,16 +105,16 @@ class Recorder:
         self._declared: list[Declaration] = []
         self._wanted, self._placer_wanted, self._bookings_wanted = asyncio.Event(), asyncio.Event(), asyncio.Event()
         self._fresher: set[str] | None = None
-        """Components published since the placer was asked for all, until it has answered."""
+        """Components published since the placer was queried for all, until its answer."""
         self._caught_up = asyncio.Event()
         self._sound = 0.0
-        """When all was last caught up and led, in seconds of the timeline."""
+        """Last time, in seconds of the timeline, at which the recorder had caught up and there was a leader."""
         self._cameras: dict[str, asyncio.Task[None]] = {}
         self._asking: asyncio.Task[None] | None = None
 
     async def run(self, stop: asyncio.Event) -> None:
-        """Records until `stop`, which it sets itself when it fails. Its liveliness token appears once it has read an
-        RCM's whole state. Raises RecorderFailed."""
+        """Record until `stop`, which a failure sets too. Declare the liveliness token once an RCM's whole state was
+        read. Raises RecorderFailed."""
         self._supervisor = Supervisor("the recorder", lambda _: stop.set())
         keys, subscribe, guard = self.mesh.keys, self.mesh.subscribe, self._supervisor.guard
         self._declared = [
@@ -128,8 +127,8 @@ class Recorder:
         ]
         self.mesh.watch_links()
         if self._where is not None:
-            self._declared.append(self.mesh.serve(keys.recorded(self.mesh.me), messages.RecordedAsk, self._tell_where))
-        # Apart: of what these miss, the RCM's state has nothing.
+            self._declared.append(self.mesh.serve(keys.recorded(self.mesh.me), messages.RecordedAsk, self._send_place))
+        # Not among `_declared`: reading the RCM's state would not restore what these miss.
         behavior, poses = guard(self._on_behavior), guard(self._on_poses)
         robots = [
             subscribe(keys.behavior_any, messages.BehaviorSaid, behavior, depth=ROBOT_DEPTH, limit=MAX_REPORT),
@@ -140,14 +139,14 @@ class Recorder:
         work = [self._keep_reading(), self._keep_asking_placer(), self._keep_asking_for_bookings(), self._tick()]
         if self.past > 0:
             work.append(self._show_past())
-        for one in work:
-            self._supervisor.spawn(one)
+        for task in work:
+            self._supervisor.spawn(task)
         try:
             await stop.wait()
             if self._supervisor.error is not None:
                 raise RecorderFailed from self._supervisor.error
-            # `stop` may be quicker than what was published before, some of which may have been missed. An answer of
-            # the RCM comes behind all that it has published; where nobody leads there is nothing to wait for.
+            # Earlier publications may still be on their way. An answer of the RCM arrives after all its publications;
+            # without a leader there is nothing to wait for.
             await self._read()
         finally:
             await self._supervisor.close()
@@ -158,7 +157,7 @@ class Recorder:
         """Seconds of the timeline."""
         return (self.mesh.now() - self._zero) / SECOND
 
-    def _tell_where(self, request: IncomingQuery[messages.RecordedAsk]) -> None:
+    def _send_place(self, request: IncomingQuery[messages.RecordedAsk]) -> None:
         if self._where is not None:
             request.answer(self._where())
 
@@ -171,7 +170,7 @@ class Recorder:
             self._requests.notice(self.now(), notice)
 
     def _on_rc_state(self, key: str, state: messages.RcState) -> None:
-        """A hold that ended at the device has ended, whether an RCM is there to publish it or not."""
+        """End holds that the RC ended, even without an RCM to publish that."""
         if self.mesh.keys.rc_of(key) != state.rc:
             return
         at = self.now()
@@ -210,10 +209,10 @@ class Recorder:
             self.timeline.event(at, LEADS[alive].format(host=token.host), level)
         elif token.role in PRESENCE:
             self.timeline.presence(at, PRESENCE[token.role][alive].format(host=token.host, name=token.name), level)
-        # Before the state was read, nobody knows that a new RC is free.
+        # Until the state was read, it is unknown whether a new RC is free.
         if token.role == Role.RC and self._requests.offer(token.name, token.host, alive) and self._caught_up.is_set():
             self._requests.rc(at, token.name, alive)
-            # Its holders, and whether it is there, are the leader's to say.
+            # The leader decides its holders, and whether it is present.
             self._wanted.set()
 
     # The whole state, where something was missed
@@ -251,7 +250,7 @@ class Recorder:
         return True
 
     async def _keep_asking_placer(self) -> None:
-        """Asks the placer at the start, and whenever something may have been missed. Does not return."""
+        """Query the placer at the start, and whenever publications may have been missed. Does not return."""
         key, failed = self.mesh.keys.placer(self.mesh.me), 0
         while True:
             if await done_within(AGAIN if 0 < failed < TRIES else None, self._placer_wanted.wait()):
@@ -268,38 +267,38 @@ class Recorder:
 
     def _on_placements(self, _key: str, news: messages.Placements) -> None:
         if self._fresher is not None and len(self._fresher) < MAX_FOLLOWED:
-            self._fresher.update(one.component for one in news.components)
+            self._fresher.update(placement.component for placement in news.components)
             self._fresher.update(news.forgotten)
         self._hosts.placements(self.now(), news)
 
-    # What is ahead, and what was before
+    # Bookings, and the past
 
     async def _keep_asking_for_bookings(self) -> None:
-        """Does not return."""
+        """Query bookings periodically. Does not return."""
         key, ask = self.mesh.keys.ask_bookings(self.mesh.me), messages.BookingsAsk()
         while True:
             self._bookings_wanted.clear()
             reply = await self.mesh.ask_one(key, ask, messages.BookingsTold, timeout=READ_TIMEOUT)
-            told = reply.message if reply is not None else None
-            if told is not None:
-                self._bookings.told(self.now(), told)
-            many = len(told.bookings) / MANY_BOOKINGS if told is not None else 1.0
+            answer = reply.message if reply is not None else None
+            if answer is not None:
+                self._bookings.take(self.now(), answer)
+            many = len(answer.bookings) / MANY_BOOKINGS if answer is not None else 1.0
             await done_within(BOOKINGS_EVERY * max(1.0, many), self._bookings_wanted.wait())
 
     async def _show_past(self) -> None:
-        """What was held before second 0, once journals tell."""
+        """Draw the holds before second 0, once journals answer."""
         await self._caught_up.wait()
         await asyncio.sleep(COMMITTED)
         for _ in range(TRIES):
             ago = self._wall() - self._epoch
             asked = messages.HistoryAsk(since=ago + self.past, until=ago)
             try:
-                told = await ask_journals(self.mesh, self.fleet, asked, MAX_PAST, wall=self._wall)
+                history = await ask_journals(self.mesh, self.fleet, asked, MAX_PAST, wall=self._wall)
             except NoJournal as error:
-                log.info("nothing is shown of the past: %s", error)
+                log.info("the past is not shown: %s", error)
                 await asyncio.sleep(AGAIN)
                 continue
-            past = await asyncio.to_thread(past_of, told, self._epoch, self.past, self.fleet.operator_priority)
+            past = await asyncio.to_thread(past_of, history, self._epoch, self.past, self.fleet.operator_priority)
             self.timeline.past(self.past, past.lanes)
             for text in past.words:
                 self.timeline.event(self.now(), text)
@@ -312,7 +311,7 @@ class Recorder:
         return any(role == Role.RCM for _, role, _ in self._tokens)
 
     def _show_banner(self, at: float) -> None:
-        """Says above the panes why they may be empty or old, once that has lasted for BANNER_AFTER seconds."""
+        """Explain above the panes why they may be empty or outdated, after BANNER_AFTER seconds."""
         if self._caught_up.is_set() and self._led:
             self._sound = at
             text = ""
@@ -348,7 +347,7 @@ class Recorder:
             self._robots.no_frame(at, camera)
 
     async def _look(self, camera: str) -> None:
-        """Shows a camera's pictures: the newest there is, whenever the next one is due."""
+        """Record a camera's newest picture whenever the next is due."""
         with closing(self.mesh.frames(self.mesh.keys.frame(camera))) as watch:
             while True:
                 frame = await watch.next(NO_PICTURE)

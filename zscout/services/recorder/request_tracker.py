@@ -1,5 +1,4 @@
-"""Requests and holders of devices as the leader publishes them, put together for the timeline: pure; times are passed
-in."""
+"""Requests and holders from the leader's publications, for the timeline. Pure; times are passed in."""
 
 from __future__ import annotations
 
@@ -36,20 +35,20 @@ Key = tuple[str, str]
 @dataclass(slots=True)
 class _Request:
     label: str
-    """Name and person: `survey (alice)`; the name has a number where several are open at one time."""
+    """Name and person: `survey (alice)`; numbered if several open requests have the same."""
     who: str = ""
-    """`alice@ws1`, where its client says so."""
+    """`alice@ws1`, if its client gives a user."""
     command: str = ""
-    """What its user runs, likewise."""
+    """The user's command, if given."""
     preempted: bool = False
-    """It waits again."""
+    """True while it waits after a preemption."""
     state: str = ""
     detail: str = ""
     grant: Grant | None = None
     starts: bool = False
-    """Its devices have not begun."""
+    """True while its devices have not begun."""
     last: tuple[Term, int] = field(default=(NO_TERM, 0))
-    """The newest notice."""
+    """Term and step of the newest notice."""
 
     def take_owner(self, view: Holder | HoldView | WaitView | Notice) -> None:
         if view.who is not None and view.who.user:
@@ -58,23 +57,23 @@ class _Request:
 
 
 class RequestTracker:
-    """Writes to `timeline` who holds what and what each ARC is doing."""
+    """Writes the holders of devices and the states of ARCs to `timeline`."""
 
     def __init__(self, timeline: Timeline, operator_priority: int) -> None:
         self.timeline, self.operator_priority = timeline, operator_priority
         self.term: Term = NO_TERM
         self.seq = 0
-        """The newest publication; older ones are ignored."""
+        """Number of the newest publication; older publications are ignored."""
         self._requests: dict[Key, _Request] = {}
         self._labels: set[str] = set()
         self._rcs = timeline.robots.holds
         self._absent: dict[str, str] = {}
-        """Words for devices that are not there: they had holders, or could have had."""
+        """Texts for devices that are absent, after they were present."""
         self.offered: dict[str, set[str]] = {}
-        """By device the hosts that offer it, as this recorder sees by token."""
+        """By device the hosts that offer it, according to tokens."""
 
     def grants(self, at: float, grants: Grants) -> bool:
-        """What the RCM publishes; returns whether something before it was missed."""
+        """Take a publication of the RCM; return True if earlier publications were missed."""
         if (grants.term, grants.seq) < (self.term, self.seq) or absurd(grants.term, self.term):
             return False
         missed = grants.term != self.term or grants.prev > self.seq
@@ -88,7 +87,7 @@ class RequestTracker:
         return missed
 
     def notice(self, at: float, notice: Notice) -> None:
-        """How a request stands, as published to its client."""
+        """Take the notice of a request."""
         if notice.term < self.term:
             return
         key = (notice.client, notice.id)
@@ -99,12 +98,12 @@ class RequestTracker:
         if request is None or (notice.term, notice.step) <= request.last:
             return
         request.last = (notice.term, notice.step)
-        # That it runs, and no longer runs, is read from the publication.
+        # Publications show when it begins and ends to run.
         if notice.state == "queued" and request.state != "running":
             self._waits(at, request, notice.reason, notice.why)
 
     def state(self, at: float, state: RcmState) -> bool:
-        """The RCM's whole state; False if it is older than what was published."""
+        """Take the RCM's whole state; return False if publications are newer."""
         if (state.term, state.seq) < (self.term, self.seq):
             return False
         self.term, self.seq = state.term, state.seq
@@ -124,10 +123,10 @@ class RequestTracker:
             request.grant, request.preempted = None, wait.preemptions > 0
             self._waits(at, request, wait.reason, wait.why)
         for key in [key for key in self._requests if key not in open_now]:
-            # What the answer left out may still wait.
+            # Queued requests may be missing in the answer.
             if not state.more or self._requests[key].grant is not None:
-                self._ended(at, key, "ended", "while nobody listened")
-        # An RC of a request that nobody has yet offered is not there either, but nobody misses it.
+                self._ended(at, key, "ended", "while not recorded")
+        # An RC that is only named by a request is not marked as absent: it was never present.
         for view in state.rcs:
             if view.present:
                 self._absent.pop(view.rc, None)
@@ -143,7 +142,7 @@ class RequestTracker:
         return any((rc in self._absent) == (rc in self.offered) for rc in self._rcs)
 
     def offer(self, rc: str, host: str, alive: bool) -> bool:
-        """A host offers a device from now on, or no longer; returns whether the device has come or gone with that."""
+        """A host starts or stops offering a device; return True if the device appeared or disappeared with that."""
         before = rc in self.offered
         (self.offered.setdefault(rc, set()).add if alive else self.offered.get(rc, set()).discard)(host)
         if not self.offered.get(rc):
@@ -151,7 +150,7 @@ class RequestTracker:
         return before != (rc in self.offered)
 
     def rc(self, at: float, rc: str, alive: bool) -> None:
-        """A device has come or gone. One that is not known yet is free."""
+        """A device appeared or disappeared. A new device is free."""
         was = self._absent.pop(rc, None)
         if not alive and rc in self._rcs:
             self._absent[rc] = "not there"
@@ -161,7 +160,7 @@ class RequestTracker:
             self._draw(at, rc)
 
     def dropped(self, at: float, rc: str, grants: set[Grant]) -> None:
-        """These holds of an RC are over, by the RCM's word or by the RC's own."""
+        """These holds of an RC ended, according to the RCM or the RC."""
         held = self._rcs.get(rc, {})
         if grants & held.keys():
             self._rcs[rc] = {grant: holder for grant, holder in held.items() if grant not in grants}
@@ -193,7 +192,7 @@ class RequestTracker:
                 self._ended(at, (revoked.client, revoked.id), outcome, revoked.reason, revoked.why)
 
     def _move(self, at: float, revoked: Revocation, grants: Grants) -> None:
-        """The request continues in another client: it keeps its lane."""
+        """Continue the request at another client, in the same lane."""
         request = self._requests.pop((revoked.client, revoked.id))
         self.timeline.event(at, f"{request.label} continues in another client: {revoked.reason}")
         for holder in (holder for rc in revoked.rcs for holder in grants.rcs.get(rc, [])):
@@ -238,7 +237,7 @@ class RequestTracker:
         self.timeline.event(at, f"{request.label} {ended(outcome, reason, why)}", level)
 
     def _track(self, key: Key, view: Holder | HoldView | WaitView | Notice) -> _Request | None:
-        """The request, followed from now on; None where too many are open."""
+        """Follow a request; return None if too many are open."""
         request = self._requests.get(key)
         if request is None and len(self._requests) < MAX_OPEN:
             label, number = with_person(view.arc, view.who), 1
@@ -256,21 +255,21 @@ class RequestTracker:
         self.timeline.arc(at, request.label, state, detail, operator=operator)
 
     def _blocked(self, reason: str, why: ReasonInfo | None) -> str:
-        """Who is in its way, by the names of their lanes: in a short bar only the beginning can be read."""
+        """The requests that block it, first, by the names of their lanes: a short bar shows only the beginning."""
         if why is None or why.code != ReasonCode.HELD or not why.by:
             words = self._named(reason, why)
             return words.removeprefix("waits ") if waits_for_others(why) else words
         others = dict.fromkeys(self._label(party) for party in why.by)
         patterns = why.patterns or [""] * len(why.rcs)
         wanted = [", ".join(short_names(rc for rc, pattern in zip(why.rcs, patterns, strict=False) if not pattern))]
-        for one in dict.fromkeys(filter(None, patterns)):
-            choices = [rc for rc, pattern in zip(why.rcs, patterns, strict=False) if pattern == one]
+        for need in dict.fromkeys(filter(None, patterns)):
+            choices = [rc for rc, pattern in zip(why.rcs, patterns, strict=False) if pattern == need]
             wanted.append(f"one of {', '.join(short_names(choices))}" if len(choices) > 1 else choices[0])
         more = f" and {why.count - len(why.rcs)} more" if why.count > len(why.rcs) else ""
         return f"for {', '.join(others)}: {'; '.join(filter(None, wanted))}{more}"
 
     def _named(self, reason: str, why: ReasonInfo | None) -> str:
-        """The reason with requests named as their lanes are."""
+        """The reason, with the names of requests' lanes."""
         return str(reason_of(why, self._label) or reason)
 
     def _label(self, view: Holder | HoldView | ReasonParty) -> str:

@@ -1,5 +1,5 @@
-"""The robots' part of the timeline: what each behavior does, who looks through which camera, what devices
-report of themselves, and the floor. Times are passed in."""
+"""The robots' part of the timeline: activities of behaviors, pictures of cameras, figures and health of devices, and
+the floor. Times are passed in."""
 
 from __future__ import annotations
 
@@ -22,26 +22,26 @@ from zscout.services.recorder.floor_plan import MAX_NAME, FloorPlan, Look
 from zscout.types import SECOND, Grant
 
 RATE: Final = 20
-"""Reports of one sender recorded in a second, and at once."""
+"""Reports of one sender recorded in a second, and in a burst."""
 MAX_WAITING: Final = 256
-"""Paths of one sender whose newest report waits for its turn."""
+"""Paths of one sender whose newest report may wait."""
 MAX_SENDERS: Final = 1_000
 DROPS_EVERY: Final = 10.0
-"""Seconds between two figures of what was dropped of one sender."""
+"""Seconds between two events about dropped reports of a sender."""
 MAX_FOLLOWED: Final = 2_000
-"""Behaviors, and RCs, that are followed at one time."""
+"""Behaviors, and RCs, followed at one time."""
 MAX_LANES: Final = 500
 MAX_DEPTH: Final = 8
-"""Behaviors above each other that have parts of an entity of their own."""
+"""Levels of the tree of behaviors that become parts of an entity."""
 DETAILS: Final = 200
-"""Distinct texts of one lane with their details; from then on it shows the words alone."""
+"""Distinct texts with details in one lane; further ones are shown without details."""
 MAX_CAMERAS: Final = 32
 MAX_SIDE: Final = 4_096
 """Pixels of a picture's longer side."""
 MAX_BOXES: Final = 32
-"""Over one picture, whoever drew them."""
+"""Boxes over one picture, of all behaviors."""
 DIM: Final = 0.25
-"""Opacity of a picture that is an old one."""
+"""Opacity of an outdated picture."""
 MAX_CAPTION: Final = 48
 """Characters."""
 HEALTH_SPACING: Final = 1.0
@@ -50,10 +50,10 @@ MAX_SERIES: Final = 200
 SPACING: Final = 0.5
 """Seconds between two points; devices report once a second at most."""
 AGAIN: Final = 30.0
-"""Seconds after which a figure that has not changed is drawn again."""
+"""Seconds after which an unchanged figure is drawn again."""
 
 BehaviorKey = tuple[Sender, str]
-"""A behavior: its client, and its path."""
+"""A behavior's client and path."""
 NO_HOLD: Final = HolderRow("")
 
 
@@ -61,20 +61,20 @@ NO_HOLD: Final = HolderRow("")
 class _Sender:
     bucket: Bucket
     waiting: dict[str, BehaviorSaid] = field(default_factory=dict)
-    """The newest report of each path that came too fast, oldest first."""
+    """The newest waiting report of each path, oldest first."""
     dropped: int = 0
     counted_at: float = -DROPS_EVERY
 
 
 class RateLimiter:
-    """Passes on the reports of each sender, at most `RATE` a second. What comes faster waits, and of each
-    path only the newest is kept: however much was dropped, what is passed on last is how it is."""
+    """Passes on reports, at most `RATE` a second of each sender. Further reports wait, of each path only the newest, so
+    that the last one passed on is always up to date."""
 
     def __init__(self) -> None:
         self._senders: dict[Sender, _Sender] = {}
 
     def offer(self, at: float, sender: Sender, report: BehaviorSaid) -> bool:
-        """Whether it is to be recorded now."""
+        """Return True if the report may be recorded now; else it waits."""
         state = self._senders.pop(sender, None)
         if state is None:
             if len(self._senders) >= MAX_SENDERS:
@@ -91,13 +91,13 @@ class RateLimiter:
         return False
 
     def due(self, at: float) -> Iterator[tuple[Sender, BehaviorSaid]]:
-        """What has waited and is to be recorded now."""
+        """Yield waiting reports that may be recorded now."""
         for sender, state in self._senders.items():
             while state.waiting and state.bucket.admits(1, round(at * SECOND)):
                 yield sender, state.waiting.pop(next(iter(state.waiting)))
 
     def dropped(self, at: float) -> Iterator[tuple[Sender, int]]:
-        """Senders of which reports were dropped, and how many since the last figure."""
+        """Yield senders of dropped reports, with their number since the last time."""
         for sender, state in self._senders.items():
             if state.dropped and at - state.counted_at >= DROPS_EVERY:
                 state.counted_at, count, state.dropped = at, state.dropped, 0
@@ -110,9 +110,9 @@ class RateLimiter:
 @dataclass(slots=True)
 class _Health:
     words: str = ""
-    """As it is; empty: well."""
+    """The present state in words; empty if well."""
     shown: str = ""
-    """As it was shown last."""
+    """The state shown last."""
     at: float = -HEALTH_SPACING
 
 
@@ -123,7 +123,7 @@ class _Camera:
     hold: HolderRow = NO_HOLD
     boxes: dict[BehaviorKey, list[Box]] = field(default_factory=dict)
     size: tuple[int, int] | None = None
-    """Of its last picture, in pixels; None before it has a pane."""
+    """Size of the last picture in pixels; None before it has a pane."""
     jpeg: bytes = b""
     """Its last picture."""
     old: bool = False
@@ -134,35 +134,35 @@ class _Camera:
 
 
 class RobotTracker:
-    """Draws what is published of robots."""
+    """Draws the publications about robots and devices."""
 
     def __init__(self, drawing: Drawing) -> None:
         self._drawing = drawing
         self.floor = FloorPlan(drawing, self._look)
         self.holds: dict[str, dict[Grant, HolderRow]] = {}
-        """By RC."""
+        """Holders by RC and grant."""
         self._limiter = RateLimiter()
         self._reports: dict[BehaviorKey, BehaviorSaid] = {}
-        """What each behavior does, the one that reported longest ago first."""
+        """The newest report of each behavior, the oldest first."""
         self._behaviors = Lanes(drawing, "behavior", MAX_LANES, "behaviors: the others have no lane", depth=MAX_DEPTH)
         self._cameras: dict[str, _Camera] = {}
         self._health: dict[str, _Health] = {}
         self._duplicates: dict[tuple[str, str], str] = {}
-        """By RC and host: for whom an instance stands by."""
+        """By RC and host: the instance for which this instance is on standby."""
         self._figures: dict[tuple[str, str], tuple[float, float]] = {}
-        """When and what was drawn last, by RC and figure."""
+        """Time and value of the last point, by RC and figure."""
 
     @property
     def shown(self) -> RobotLayout:
-        cameras = [(one.entity, clean_text(one.name, MAX_CAPTION)) for one in self._with_pane()]
+        cameras = [(camera.entity, clean_text(camera.name, MAX_CAPTION)) for camera in self._with_pane()]
         return RobotLayout(tuple(cameras), self.floor.size, self._behaviors.rows, min(len(self._figures), LEGEND + 1))
 
     def tick(self, at: float) -> None:
-        """What time alone brings: call it some times a second."""
+        """Update for the passing of time; called several times a second."""
         for sender, report in list(self._limiter.due(at)):
             self._take(at, sender, report)
         for sender, count in self._limiter.dropped(at):
-            self._drawing.warn(at, f"behaviors of {sender} say too much: {count} sayings were left out")
+            self._drawing.warn(at, f"too many reports of behaviors from {sender}: dropped {count}")
         for rc, health in self._health.items():
             self._show_health(at, rc, health)
         self.floor.tick(at)
@@ -174,7 +174,7 @@ class RobotTracker:
             self._take(at, sender, report)
 
     def left(self, at: float, sender: Sender) -> None:
-        """A client is gone, and its behaviors with it."""
+        """End the behaviors of a client that is gone."""
         for path in [path for client, path in self._reports if client == sender]:
             self._take(at, sender, BehaviorSaid(path, ""))
         self._limiter.forget(sender)
@@ -184,7 +184,7 @@ class RobotTracker:
         before = self._reports.pop(key, None)
         if report.doing and len(self._reports) < MAX_FOLLOWED:
             self._reports[key] = report
-        # A behavior that has moved to another client is over in the old one only.
+        # A behavior that moved to another client continues there.
         if report.doing or all(path != report.path for _, path in self._reports):
             self._show_behavior(at, report)
         if report.alert:
@@ -204,7 +204,7 @@ class RobotTracker:
             return
         word = clean_text(doing)
         text = with_detail(doing, _detail(report))
-        # A text that had lost its colour would get any; the word alone says as much in the right one.
+        # A further text could have no colour of its own; the word alone has the right colour.
         if known is not None and len(known) >= DETAILS and text not in known:
             text = word
         self._behaviors.show(at, report.path, {text: (text, DOING.get(word, OTHER))})
@@ -237,7 +237,9 @@ class RobotTracker:
         seen.hold = hold
         size = jpeg_size(jpeg)
         if size is None or max(size) > MAX_SIDE:
-            self._drawing.note(at, f"{seen.name} sends what is no JPEG of at most {MAX_SIDE} pixels a side: left out")
+            self._drawing.note(
+                at, f"{seen.name} sends pictures that are no JPEG of at most {MAX_SIDE} pixels a side: left out"
+            )
             return
         others = "cameras: the pictures of the others are not shown"
         if seen.size is None and not self._drawing.room(at, self._with_pane(), MAX_CAMERAS, others):
@@ -248,7 +250,7 @@ class RobotTracker:
         self._drawing.arrange()
 
     def no_frame(self, at: float, camera: str) -> None:
-        """No picture has come for a while: the last one is an old one, dimmed until the next."""
+        """No picture has arrived for a while: dim the last picture until the next."""
         seen = self._cameras.get(camera)
         if seen is None:
             return
@@ -261,7 +263,7 @@ class RobotTracker:
         self._write(at, seen, words, PALE)
 
     def _draw_picture(self, at: float, seen: _Camera, jpeg: bytes, opacity: float) -> None:
-        """Logs the whole picture at each change: a file, or a viewer that comes late, may lack the one before."""
+        """Log the whole picture at each change: a file, or a late viewer, may lack the previous one."""
         seen.jpeg = jpeg
         self._drawing.show_again(
             at, seen.entity, rr.EncodedImage, contents=jpeg, media_type="image/jpeg", opacity=opacity
@@ -271,7 +273,7 @@ class RobotTracker:
         return [camera for _, camera in sorted(self._cameras.items()) if camera.size is not None]
 
     def _caption(self, seen: _Camera) -> tuple[str, int]:
-        """Words and colour."""
+        """Text and colour of a camera's caption."""
         _, operator, robots = seen.hold
         if operator:
             return (f"{seen.robots} · operator" if robots else "operator"), OPERATOR
@@ -281,7 +283,7 @@ class RobotTracker:
         return f"{seen.robots} · {report.doing}", DOING.get(report.doing, PALE)
 
     def _write(self, at: float, seen: _Camera, caption: str, colour: int) -> None:
-        """The caption hangs from the middle of the upper edge: a view's title could not follow the time."""
+        """Draw the caption below the middle of the upper edge: a view's title can't change with time."""
         words = clean_text(caption, MAX_CAPTION)
         self._drawing.show(
             at,
@@ -295,7 +297,7 @@ class RobotTracker:
         )
 
     def _draw_boxes(self, at: float, seen: _Camera) -> None:
-        """From `at` on, these are drawn over the camera's pictures, in their pixels."""
+        """Draw the boxes over the camera's pictures, in pixels, from `at` on."""
         boxes = [box for some in seen.boxes.values() for box in some][:MAX_BOXES]
         self._drawing.show(
             at,
@@ -310,13 +312,13 @@ class RobotTracker:
     # Devices
 
     def state(self, at: float, state: RcState) -> None:
-        """What an RC publishes of itself: its device's figures, and its health; or that it stands by."""
+        """Take the state of an RC: figures and health of its device, or that it is on standby."""
         instance = state.rc, state.host
         if state.duplicate_of != self._duplicates.get(instance, "") and len(self._duplicates) < MAX_FOLLOWED:
             self._duplicates[instance] = state.duplicate_of
-            stands = f"stands by: duplicate of {state.duplicate_of}" if state.duplicate_of else "serves"
+            role = f"stands by: duplicate of {state.duplicate_of}" if state.duplicate_of else "serves"
             (self._drawing.warn if state.duplicate_of else self._drawing.event)(
-                at, f"{state.rc} at {state.host} {stands}"
+                at, f"{state.rc} at {state.host} {role}"
             )
         if state.duplicate_of:
             return
@@ -340,7 +342,7 @@ class RobotTracker:
             self._drawing.event(at, f"{rc} is well again")
 
     def _draw_figures(self, at: float, rc: str, figures: Mapping[str, float]) -> None:
-        """What is not a finite number is left out."""
+        """Draw figures as curves, without values that are not finite."""
         for figure, value in figures.items():
             key = rc, figure
             drawn_at, last = self._figures.get(key, (-math.inf, math.nan))
@@ -360,16 +362,16 @@ class RobotTracker:
 
 
 def _detail(report: BehaviorSaid) -> str:
-    """What stands behind the word in a lane: of an alert under another word, that too."""
+    """The detail after the word in a lane; for an alert, preceded by the report's own word."""
     words = report.doing if report.alert and report.doing != "alert" else ""
     return " · ".join(filter(None, (words, report.detail)))
 
 
 def _alert(report: BehaviorSaid) -> str:
-    who = _name(report.robot) if report.robot else report.path
+    subject = _name(report.robot) if report.robot else report.path
     if report.doing == "alert":
-        return f"{who} sees {report.detail or 'something'}"
-    return f"{who}: {_detail(report)}"
+        return f"{subject} sees {report.detail or 'something'}"
+    return f"{subject}: {_detail(report)}"
 
 
 def _name(robot: str) -> str:

@@ -1,4 +1,4 @@
-"""Writes what the mesh shows to Rerun: a recording file, a live server for viewers, or both."""
+"""Writes the activity of the mesh to Rerun: to a recording file, a live server for viewers, or both."""
 
 from __future__ import annotations
 
@@ -45,47 +45,47 @@ from zscout.services.recorder.robots import RobotTracker
 log = logging.getLogger(__name__)
 
 SERVER_MEMORY: Final = "200MB"
-"""What the live server keeps for viewers that come late; the oldest goes first."""
+"""Memory of the live server for viewers that connect later; the oldest data is dropped first."""
 MAX_ARCS: Final = 2000
 MAX_RCS: Final = 1000
 WAITING: Final = ("waiting", "waiting again", "preempted")
-"""States of a request that has a row in the pane of those who wait."""
+"""States of a request with a row in the pane of waiting requests."""
 WAITING_STATES: Final = 128
 RC_STATES: Final = 256
 MAX_COLOURS: Final = 10_000
-"""ARCs and components that have a colour of their own."""
+"""ARCs and components with a colour of their own."""
 ARC_STATES: Final = 16
 OPERATOR_MARK: Final = " (operator)"
-"""Follows the name of the request in a device's lane where an operator holds it."""
+"""Suffix of an operator's request in a device's lane."""
 CONTENDED: Final = 300.0
-"""Seconds for which an RC for which nobody waits any more stands among the contended ones of a live view."""
+"""Seconds for which an RC stays among the contended RCs of a live view after the last request for it waited."""
 REGROUP: Final = 5.0
-"""Least time between two changes of a live view's panes, in seconds."""
+"""Least seconds between two changes of a live view's panes."""
 ROWS_MORE: Final = 4
-"""The chart of bookings grows by so many rows."""
+"""Rows by which the chart of bookings grows."""
 PAST_MARK: Final = " (journal)"
-"""Follows the name of the request in a device's lane where a journal reported it."""
+"""Suffix of a journal's request in a device's lane."""
 PAST_PART: Final = 0.4
-"""Of a colour that is left then."""
+"""Opacity of a bar from a journal."""
 FILE_TICK: Final = 1.0
-"""Seconds for which a file gathers what it writes: a file that is written to its end is made of few, large chunks
-only then, and one whose recorder was killed stays as it is."""
+"""Seconds of data per chunk of a file. A complete file is rewritten in few, large chunks; after a kill it stays as it
+is."""
 LIVE_TICK: Final = 0.4
-"""The same for viewers that look on: for as long as nobody minds."""
+"""Seconds of data per chunk for live viewers: a delay that does not disturb."""
 FLUSH_SECONDS: Final = 5.0
 DISCONNECT_SECONDS: Final = 8.0
 
 
 class TimelineError(BadInput):
-    """The recording can't be written or served: one line that says what, where and how to mend it."""
+    """The recording can't be written or served; the text is one line with fault, place and remedy."""
 
 
 class Timeline(Drawing):
     """The Rerun side of a recorder. After `close` every call does nothing.
 
-    `fleet` names the recording, together with the time of the start. `path`: the `.rrd` file, replaced if it is there,
-    or None. `port`: the live server's TCP port on the IP address `bind`, 0 for a free one, or None for no server; one
-    of file and server there must be. `wall`: the timeline has wall-clock times, once `start_clock` was called. Raises
+    `fleet` names the recording, together with the time of the start. `path`: the `.rrd` file, replaced if it exists,
+    or None. `port`: the live server's TCP port on the IP address `bind`, 0 for a free port, or None for no server. File
+    or server is required. `wall`: the timeline has wall-clock times, once `start_clock` was called. Raises
     TimelineError if the port is taken or the file can't be written."""
 
     def __init__(
@@ -94,37 +94,37 @@ class Timeline(Drawing):
         super().__init__()
         self._fleet, self._wall = fleet, wall
         self.url: str | None = None
-        """Where a viewer finds the live server: `rerun URL`."""
+        """Address of the live server, for `rerun URL`."""
         self._path: Path | None = None
         self._live: rr.RecordingStream | None = None
         self._file: rr.RecordingStream | None = None
         self._arcs: set[str] = set()
         self._colours: dict[str, int] = {}
-        """Of requests and components, in order of appearance."""
+        """Colours of requests and components, in order of appearance."""
         self._namesakes: dict[str, str] = {}
-        """The first request of each name: a component or booking of that name has the same colour."""
+        """The first request of each name, whose colour a component or booking of that name shares."""
         self._rc_lanes = Lanes(self, "devices", MAX_RCS, "devices: the others have no lane", colours=RC_STATES)
         self._arc_lanes = Lanes(self, "requests", MAX_ARCS, "requests: the others have no lane", colours=ARC_STATES)
         self._waiting_lane = Lanes(self, "who", 1, "", colours=WAITING_STATES, slots=MAX_WAITING_ROWS)
         self._waiting: dict[str, tuple[str, int]] = {}
-        """Text and colour of each request that waits, the one that has waited longest first."""
+        """Text and colour of each waiting request, in order of waiting time, the longest first."""
         self.hosts = HostTracker(self, self._colour_of)
         self.robots = RobotTracker(self)
         self.bookings = BookingTracker(self, self._colour_of)
         self._arranged: object = None
         self._banner = ""
         self._open_colours: dict[str, int] = {}
-        """Of requests that wait or run."""
+        """Colours of open requests."""
         self._contended: dict[str, float] = {}
-        """When somebody waited last for an RC, by entity."""
+        """By entity of an RC: the last time that a request waited for it."""
         self._absent: set[str] = set()
         self._grouped = -REGROUP
-        """When RCs were grouped last for the live view."""
+        """Time of the last grouping of RCs for the live view."""
         self._groups: tuple[tuple[str, ...], tuple[str, ...]] = (), ()
         self._rows: tuple[int, int, int] = 0, 0, 0
-        """Rows of devices, requests and those who wait, as the live view has room for."""
+        """Rows of devices, requests and waiting requests in the live view's layout."""
         self._past, self._past_here = 0.0, False
-        """Seconds of the past that journals told of; and whether the present file has them."""
+        """Seconds of the past drawn from journals, and True if the present file has them."""
         if port is not None:
             port = _free_port(bind, port)
             host = f"[{bind}]" if ":" in bind else bind
@@ -146,7 +146,7 @@ class Timeline(Drawing):
                 f"can't write the recording {path} ({error.strerror}); "
                 "give a file in a directory that is there and can be written"
             ) from error
-        # A footer needs memory for each chunk, for as long as a fleet is recorded. The finished file has one.
+        # A footer needs memory for each chunk, as long as a fleet is recorded. `finish` adds it.
         stream = self._open(rr.FileSink(path, write_footer=not self._wall), str(path), FILE_TICK)
         self._path = path
         return stream
@@ -162,7 +162,7 @@ class Timeline(Drawing):
         stream.set_log_tick_enabled(False)
         try:
             stream.set_sinks(sink, default_blueprint=blueprint(Layout(wall=self._wall)))
-            # The server comes up in a thread of its own; only a flush shows its failure.
+            # The server starts in a thread of its own; only a flush shows its failure.
             stream.flush(timeout_sec=FLUSH_SECONDS)
         except (RuntimeError, ValueError) as error:
             disconnect(stream, DISCONNECT_SECONDS)
@@ -173,15 +173,16 @@ class Timeline(Drawing):
         return stream
 
     def start_clock(self, epoch: float) -> None:
-        """Second 0 is `epoch`, as `time.time()` has it. Nothing where the timeline has durations."""
+        """Set second 0 to `epoch`, as from `time.time()`. Does nothing on a timeline of durations."""
         if self._wall:
             self.epoch = epoch
             for stream in self.streams:
                 stream.send_recording_start_time_nanos(round(epoch * 1e9))
 
     def roll(self, at: float, path: Path) -> Job | None:
-        """Goes on in another file, which begins with what is shown now; returns what there is to finish, if the file
-        before it could be written. Raises TimelineError where the new one can't be: then all stays as it is."""
+        """Continue in another file, which starts with the present state. Return the job to finish the previous file,
+        None if that could not be written. Raises TimelineError if the new file can't be written, and changes
+        nothing."""
         before, old, layout = self._file, self._path, self.layout(live=False)
         if before is None or old is None or self.closed:
             return None
@@ -196,16 +197,16 @@ class Timeline(Drawing):
         return Job(old, layout) if disconnect(before, DISCONNECT_SECONDS) else None
 
     def unwritten(self) -> str:
-        """Why the file can't be written, empty while it can. Blocks until it has what was logged."""
+        """Why the file can't be written; empty if it can. Blocks until it has all logged data."""
         if self._file is None or self._path is None or self.closed:
             return ""
         return unwritten(self._file, self._path, FLUSH_SECONDS)
 
     def holders(self, at: float, rc: str, holders: Sequence[HolderRow], absent: str = "") -> None:
-        """From `at` on, the device (`kind/name`) is held by exactly these requests; by nobody if empty. `absent`: the
-        words for a device that is not there.
+        """From `at` on, the device (`kind/name`) is held by exactly these requests. `absent`: the text for an absent
+        device.
 
-        Several holders get a row each. A row reads the request's name, with `OPERATOR_MARK` for an operator's."""
+        Each holder gets a row with its request's name, and `OPERATOR_MARK` for an operator."""
         entity = self._rc_lanes.entity(rc)
         (self._absent.add if absent else self._absent.discard)(entity)
         shown: dict[str, tuple[str, int]] = {absent: (clean_text(absent), ABSENT)} if absent and not holders else {}
@@ -215,7 +216,7 @@ class Timeline(Drawing):
         self._rc_lanes.show(at, rc, shown)
 
     def past(self, seconds: float, lanes: Mapping[str, PastLane]) -> None:
-        """What RCs showed before second 0, as journals tell, for up to so many seconds."""
+        """Draw the lanes of RCs for up to `seconds` before second 0, from journals."""
         if not lanes or self.closed:
             return
         for rc, changes in lanes.items():
@@ -232,13 +233,13 @@ class Timeline(Drawing):
         return name, faded(OPERATOR if bar.operator else self._colour_of(bar.arc), PAST_PART)
 
     def contended(self, at: float, rcs: Iterable[str]) -> None:
-        """Somebody waits for these RCs: they are shown first."""
+        """Requests wait for these RCs: they are shown first."""
         for entity in map(self._rc_lanes.entity, rcs):
             if entity in self._contended or len(self._contended) < MAX_RCS:
                 self._contended[entity] = at
 
     def regroup(self, at: float) -> None:
-        """What time alone brings: call it now and then."""
+        """Update for the passing of time; called regularly."""
         self.pass_points(at)
         if at - self._grouped >= REGROUP:
             self._grouped = at
@@ -247,7 +248,7 @@ class Timeline(Drawing):
             self.arrange()
 
     def _grouped_rcs(self, since: float) -> tuple[tuple[str, ...], tuple[str, ...]]:
-        """Entities of RCs that somebody has waited for since then, and of those that are not there."""
+        """Entities of RCs that requests have waited for since `since`, and of absent RCs."""
         there = self._rc_lanes.entities.keys() - self._absent
         contended = (entity for entity, at in self._contended.items() if at >= since and entity in there)
         return tuple(sorted(contended)), tuple(sorted(self._absent))
@@ -255,8 +256,8 @@ class Timeline(Drawing):
     def arc(self, at: float, arc: str, state: str, detail: str = "", *, operator: bool = False) -> None:
         """From `at` on, the request is in `state`: "waiting", "running", "preempted", "done" or another word.
 
-        `arc` is its name, with the person behind it in parentheses: the lane is then `person/name`. `detail` says more
-        in the same bar, such as why it waits. An empty `state` ends the lane. What an `operator` runs has an operator's
+        `arc` is its name, with the person in parentheses: the lane is then `person/name`. `detail` is added to the same
+        bar, such as why it waits. An empty `state` ends the lane. An `operator`'s running request has an operator's
         colour."""
         own = self._colour(at, arc)
         if arc not in self._arcs:
@@ -280,14 +281,14 @@ class Timeline(Drawing):
         self._waiting_lane.show(at, "waits", self._waiting)
 
     def banner(self, text: str) -> None:
-        """Shows `text` above all panes of the live view; nothing if it is empty."""
+        """Show `text` above all panes of the live view; remove it if empty."""
         if text != self._banner and not self.closed:
             self._banner = text
             self.log(None, "banner", rr.TextDocument(clean_text(text, MAX_EVENT)))
             self.arrange()
 
     def close(self) -> None:
-        """Ends file and server, within seconds. The file then opens on the whole run.
+        """End file and server within seconds. The file then opens on the whole run.
 
         Raises TimelineError if not everything could be written."""
         if self.closed:
@@ -314,11 +315,11 @@ class Timeline(Drawing):
                 log.warning("the recording %s stays as it was written, and opens slowly: %s", self._path, error)
 
     def _finish(self, path: Path, layout: Layout) -> None:
-        """What is done with a file that is over."""
+        """Finish a complete file."""
         finish(path, layout)
 
     def _end(self) -> bool:
-        """Whether the file was written to its end; a viewer that hangs holds up the server alone."""
+        """Disconnect all; return True if the file was written completely. A hanging viewer delays only the server."""
         ended = {id(stream): disconnect(stream, DISCONNECT_SECONDS) for stream in reversed(self.streams)}
         return ended.get(id(self._file), False)
 
@@ -329,8 +330,7 @@ class Timeline(Drawing):
         self.close()
 
     def arrange(self) -> None:
-        """Lays the viewer out anew if there is something new to show: a fleet without robots, figures or components
-        has no use for empty panes."""
+        """Send a new layout if there is something new to show: panes without content are left out."""
         robots = self.robots.shown
         robots = robots._replace(behavior_rows=min(robots.behavior_rows, 1))
         rows = tuple(min(count, most) for count, most in zip(self._rows, MOST_ROWS, strict=True))
@@ -343,7 +343,7 @@ class Timeline(Drawing):
                 stream.send_blueprint(layout)
 
     def layout(self, *, live: bool) -> Layout:
-        """Panes for what there is; those of a live view may fill yet."""
+        """The layout for the present content; panes of a live view may still be empty."""
         robots = self.robots.shown
         rc_rows, arc_rows, host_rows = (lanes.rows for lanes in (self._rc_lanes, self._arc_lanes, self.hosts.lanes))
         if live:
@@ -369,7 +369,7 @@ class Timeline(Drawing):
         )
 
     def _ahead_rows(self) -> int:
-        """A few more than there are: a layout that is sent anew undoes what people have changed of it."""
+        """Rows of the chart, rounded up: each new layout undoes people's own changes of it."""
         return min(-(-self.bookings.rows // ROWS_MORE) * ROWS_MORE, MAX_CHART_ROWS + 1)
 
     def _colour(self, at: float, arc: str) -> int:
@@ -380,8 +380,8 @@ class Timeline(Drawing):
         return self._colour_of(arc)
 
     def _colour_of(self, arc: str) -> int:
-        """The first request of a name shares its colour with a component or booking of that name. A new one gets the
-        next colour that the fewest open requests have."""
+        """The first request of a name shares its colour with a component or booking of that name. A new name gets the
+        next colour among those that the fewest open requests have."""
         name = arc.partition(" (")[0]
         if self._namesakes.get(name, name) == name and len(self._namesakes) < MAX_COLOURS:
             self._namesakes[name] = arc
@@ -396,11 +396,11 @@ class Timeline(Drawing):
 
 
 def _free_port(bind: str, port: int) -> int:
-    """Checks address and port first: of a failure Rerun itself reports only that its thread ended."""
+    """Check address and port first: Rerun would only report that its thread ended."""
     try:
         return free_port(bind, port)
     except OSError as error:
         raise TimelineError(
             f"can't listen on {bind}, port {port} ({os.strerror(error.errno or 0)}); "
-            "choose another port, or end the program that has it"
+            "choose another port, or stop the program that uses it"
         ) from error
