@@ -31,7 +31,11 @@ STRUCTS: dict[str, Any] = {
     for name, kind in inspect.getmembers(messages, inspect.isclass)
     if issubclass(kind, messages.Message) and kind is not messages.Message
 }
-EXAMPLES = re.findall(r"`zscout\.(\w+)\.v1`[^\n]*\n\n```json\n(.*?)\n```", read_page("example"), re.DOTALL)
+EXAMPLES = [
+    example
+    for page in ("example", "example-failover")
+    for example in re.findall(r"`zscout\.(\w+)\.v1`[^\n]*\n\n```json\n(.*?)\n```", read_page(page), re.DOTALL)
+]
 
 
 @pytest.mark.parametrize("name", STRUCTS)
