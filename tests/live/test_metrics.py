@@ -41,7 +41,7 @@ def get(url: str) -> str:
 async def shown(lab: Lab, host: str) -> str:
     """What a node shows now."""
     await lab.logged(host, "metrics at http")
-    url = re.findall(r"figures at (\S+)", lab.log(host))[-1]
+    url = re.findall(r"metrics at (\S+)", lab.log(host))[-1]
     return await asyncio.to_thread(get, url)
 
 
