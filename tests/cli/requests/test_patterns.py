@@ -117,9 +117,9 @@ def test_why_tells_of_all_that_match(fleet: CliFleet) -> None:
     for process, name in zip(waiting, ("next", "quiet"), strict=True):
         read_until(process, f"{name} waits")
     text = fleet.zscout("why", "next").stdout
-    one = rf"{F1} held by {re.escape(held_by('first'))}, priority 0, since {CLOCK} .* at the latest"
+    one = rf"{F1} held by {own('first')}, priority 0, since {CLOCK} .* at the latest"
     assert re.search(rf"^  framegrabber/\*: {one}$", text, re.MULTILINE)
-    assert f"\n  framegrabber/*: {F2} held by {held_by('second')}, " in text
+    assert f"\n  framegrabber/*: {F2} held by {own('second')}, " in text
     assert "\n  robot/a: no other request holds it\n" in text
     assert "\n  video/*: not on the mesh\n" in text
     assert " ago)  asked for framegrabber/*, robot/a, video/* at priority 0\n" in text
@@ -133,7 +133,7 @@ def test_why_tells_of_all_that_match(fleet: CliFleet) -> None:
     assert [holder["rc"] for holder in told["needs"][0]["holders"]] == [F1, F2]
 
     shared = fleet.zscout("why", "quiet").stdout
-    assert f"\n  radio/* (rate=5): radio/rf0 shared with {held_by('loud')} (rate=8), priority 0, since " in shared
+    assert f"\n  radio/* (rate=5): radio/rf0 shared with {own('loud')} (rate=8), priority 0, since " in shared
     assert "\n  robot/*: no request holds robot/a\n" in shared
     holds = fleet.zscout("why", "second").stdout
     assert f"\nHolds\n  {F2} for {ANY}: no other request holds it\n" in holds

@@ -8,11 +8,11 @@ import re
 import pytest
 
 from tests.cli.cli_fleet import in_lab, patient_timing
-from tests.cli.tools import CLOCK, mine, ours, zscout_soon
+from tests.cli.tools import CLOCK, mine, ours, own, zscout_soon
 from tests.live.lab import PATIENT, Lab
 
 pytestmark = pytest.mark.live
-SURVEY, TAKE, MAPPING = (re.escape(mine(name)) for name in ("survey", "take", "mapping"))
+SURVEY, TAKE = (re.escape(mine(name)) for name in ("survey", "take"))
 COMMAND = ours().partition(" (")[2][:-1]
 SOON = r"\d+(\.\d)? s"
 
@@ -37,16 +37,16 @@ async def test_the_story_of_an_arc(lab: Lab) -> None:
     lines = plain.stdout.splitlines()
     assert re.fullmatch(rf"{SURVEY}, priority 0, has waited since {CLOCK} \({SOON}\)", lines[0])
     assert lines[1] == f"  id {survey.id}, client test/program, command {COMMAND}"
-    assert re.fullmatch(rf"  waits for {TAKE}: robot/a, until {CLOCK} at the latest", lines[2])
+    assert re.fullmatch(rf"  waits for {own('take')}: robot/a, until {CLOCK} at the latest", lines[2])
     assert lines[3].endswith("in the queue of 2; it wants 10 min")
     spans = r"\(in (10 min|9 min \d+ s)\)"
     assert re.fullmatch(rf"  it may start at {CLOCK} {spans}, if nothing else comes", lines[4])
     assert lines[5:7] == ["  it was preempted once", "Needs"]
     since, until = rf"since {CLOCK} \({SOON}\)", rf"until {CLOCK} \((10 min|9 min \d+ s)\) at the latest"
     assert re.fullmatch(
-        rf"  radio/rf0 \(rate=4\): shared with {MAPPING} \(rate=5\), priority 0, {since}, {until}", lines[7]
+        rf"  radio/rf0 \(rate=4\): shared with {own('mapping')} \(rate=5\), priority 0, {since}, {until}", lines[7]
     )
-    assert re.fullmatch(rf"  robot/a: held by {TAKE}, priority 10, {since}, {until}", lines[8])
+    assert re.fullmatch(rf"  robot/a: held by {own('take')}, priority 10, {since}, {until}", lines[8])
     assert lines[9] == "Story"
     told = [line.split(" ago)  ", 1)[1] for line in lines[10:]]
     assert re.match(rf" +{CLOCK} \(", lines[10])

@@ -13,6 +13,7 @@ from zscout.behaviors.client.client import Client
 from zscout.cli import common
 from zscout.cli.journals import ask_journals, ending, local
 from zscout.cli.journals import hold_json as past_json
+from zscout.cli.ownership import User
 from zscout.cli.requests.options import MAX_ARC_NAME, arc_argument
 from zscout.cli.requests.waiting import (
     NeedContention,
@@ -51,6 +52,7 @@ async def why(arc: str, as_json: bool) -> None:
       zscout why 4caaac1a6451 --json | jq .arcs[0].story
     """
     async with common.connected("why") as client:
+        me = User.of(client)
         state = await common.state_of(client, arc, forecast=True)
         views: list[View] = [*state.holds, *state.queue]
         same = [view for view in views if arc in (view.arc, view.id, _full(view))]
@@ -68,7 +70,7 @@ async def why(arc: str, as_json: bool) -> None:
     for number, one in enumerate(found):
         if number:
             terminal.print_line("")
-        _print(one)
+        _print(one, me)
 
 
 async def _past_holds(client: Client, arc: str, unknown: common.Failed) -> list[dict[str, Any]]:
@@ -122,17 +124,17 @@ def _say(text: str, **style: Any) -> None:
     click.secho(terminal.clean(text), **style)
 
 
-def _print(arc: dict[str, Any]) -> None:
+def _print(arc: dict[str, Any], me: User) -> None:
     if arc["state"] == "ended":
         _say(f"{arc['arc']} is not open any more", bold=True)
         if arc["holds"]:
             _print_holds(arc["holds"])
             return
     else:
-        _print_standing(arc)
+        _print_standing(arc, me)
         _say("Holds" if arc["state"] == "running" else "Needs", bold=True)
         for need in arc["needs"]:
-            _print_need(need, arc["priority"])
+            _print_need(need, arc["priority"], me)
     _say("Story", bold=True)
     spans = [f"{terminal.clock(-line['ago'])} ({terminal.span(line['ago'])} ago)" for line in arc["story"]]
     width = max(map(len, spans), default=0)
@@ -150,7 +152,7 @@ def _print_holds(holds: list[dict[str, Any]]) -> None:
         _say(f"    for {terminal.span(hold['held'])}{waited}: {hold['end']}")
 
 
-def _print_standing(arc: dict[str, Any]) -> None:
+def _print_standing(arc: dict[str, Any], me: User) -> None:
     who = f"{request_words(arc['arc'], arc['who'], arc['client'])}, priority {arc['priority']},"
     command = f", command {arc['who'].command}" if arc["who"] is not None and arc["who"].command else ""
     names = f"  id {arc['id']}, client {arc['client']}{command}{comment(arc['who'])}"
@@ -175,7 +177,7 @@ def _print_standing(arc: dict[str, Any]) -> None:
         return
     _say(f"{who} has waited since {_past(arc['waited'])}", bold=True, fg="yellow")
     _say(names)
-    _say(f"  {reason_text(arc['reason'], arc['why'])}")
+    _say(f"  {reason_text(arc['reason'], arc['why'], me=me)}")
     ahead = arc["ahead"]
     place = "nobody is ahead of it" if not ahead else f"{ahead} {'is' if ahead == 1 else 'are'} ahead of it"
     _say(f"  {place} in the queue of {arc['queued']}; it wants {runtime}")
@@ -196,7 +198,7 @@ def _end(left: float) -> str:
     return f"{terminal.clock(left)} ({terminal.span(left)})"
 
 
-def _print_need(need: dict[str, Any], priority: int) -> None:
+def _print_need(need: dict[str, Any], priority: int, me: User) -> None:
     rc = need["rc"]
     what = need["need"] if rc in (None, need["need"]) else f"{rc} for {need['need']}"
     name = f"  {common.with_amounts(what, need['params'])}"
@@ -209,4 +211,4 @@ def _print_need(need: dict[str, Any], priority: int) -> None:
     for holder in need["holders"] if need["present"] else ():
         which = "" if rc is not None else f"{holder['rc']} "
         relation = "shared with" if need["sharable"] else "held by"
-        _say(f"{name}: {which}{relation} {hold_words(holder, priority)}")
+        _say(f"{name}: {which}{relation} {hold_words(holder, priority, me)}")
