@@ -1,7 +1,7 @@
-"""What zscout promises under every fault, as far as it shows in a simulated fleet: the list of docs/promises.md.
+"""Checks of zscout's promises under faults (docs/promises.md), as far as they are visible in a simulated fleet.
 
-Promises about a device are kept by `device.py`, which sees them at every event; here are those about what clients and
-leaders believe. Some hold only once they had time to come right: their clocks start anew with every fault."""
+`device.py` checks the promises about a device at every event; this module checks the beliefs of clients and leaders.
+Some promises hold only after a time of recovery, whose clock restarts with every fault."""
 
 from __future__ import annotations
 
@@ -23,27 +23,27 @@ if TYPE_CHECKING:
     from zscout.services.rcm.rcm import Rcm
 
 HALF_A_GANG: Final = 2.0
-"""Seconds beyond the hold lease for which a client may believe in a hold that not all of its RCs have."""
+"""Seconds beyond the hold lease for which a client may believe in a hold that some of its RCs do not hold."""
 COME_RIGHT: Final = 3.0
-"""Seconds without any fault within which a leader that RCs have left has stepped down, and the leader has everybody
-at the place that it knows of."""
+"""Seconds without any fault within which a leader abandoned by RCs steps down, and clients' places are those that the
+leader knows."""
 TERMS_OF_A_FAULT: Final = 2
 TERMS_WITHIN: Final = 10.0
-"""Seconds in which no more terms begin than that for each fault, and for two at least."""
-SAID: Final = 1.5
-"""Seconds without any fault within which an RC holds what its RCM says, in one instance."""
+"""Within these seconds at most TERMS_OF_A_FAULT terms begin for each fault, counting two faults at least."""
+IN_AGREEMENT_WITHIN: Final = 1.5
+"""Seconds without any fault within which an RC holds the holds that its RCM publishes, in a single instance."""
 UNLED: Final = 0.5
-"""Seconds beyond the hold lease after which an RC that hears no RCM is held by nobody."""
+"""Seconds beyond the hold lease after which an RC without a publishing RCM has no holder."""
 JUST_NOW: Final = 0.1
 """Seconds: two looks."""
 LEFT_OVER: Final = 7.0
-"""Seconds after the last hold's end in which everything about it is forgotten, but how it ended."""
+"""Seconds after the last hold's end within which only its outcome is remembered."""
 
 PROTECTED: Final = 1.0
-"""Seconds for which a leader may not believe yet that only operators preempt a hold, as was told first."""
+"""Seconds for which a leader may not know yet that only operators preempt a hold, as published first."""
 
 UNUSED: Final = 0.3
-"""Seconds of a hold's time that may be over before its program learns that its devices are ready."""
+"""Seconds of a hold's time that may pass before its program learns that its devices are ready."""
 
 LOSSES: Final = ("lost", "client_lost")
 
@@ -51,9 +51,9 @@ Rank: TypeAlias = tuple[int, Ns, Place]
 
 
 class Promises:
-    """Told what happens; `broken(text)` is told of a promise that was not kept. Times are virtual seconds.
+    """Receives the events of a run, and calls `broken(text)` for each broken promise. Times are virtual seconds.
 
-    `strict`: the strategy grants in rank order, whatever was promised. `thief`: who asks at others' places."""
+    `strict`: the strategy grants in rank order. `thief`: the client that asks at the places of others."""
 
     def __init__(
         self, broken: Callable[[str], None], now: Callable[[], float], hold_lease: float, *, strict: bool, thief: str
@@ -61,67 +61,66 @@ class Promises:
         self._broken, self._now, self._strict, self._thief = broken, now, strict, thief
         self._hold_lease, self._half_a_gang = hold_lease, hold_lease + HALF_A_GANG
         self.terms: dict[Term, float] = {}
-        """Of every leader that was seen, and when it was seen first."""
+        """The terms of all leaders, with the time when each was first seen."""
         self.led: dict[str, Term] = {}
-        """By node: the highest term in which it led, as its disk has it."""
+        """By node: the highest term in which it led, unless its disk was emptied since."""
         self.unheard = False
-        """Whether no publication of any RCM arrives, or no token of a new one: there is one every few seconds."""
+        """True if no publication of an RCM arrives, or no token of a new RCM. Then a term begins every few seconds."""
         self._begun: list[float] = []
-        """When terms began, but for those that began unheard."""
-        self._told: dict[str, tuple[Term, int]] = {}
-        """By ARC: (term, step) of the newest that its client was told."""
+        """When terms began, without those that began while `unheard`."""
+        self._newest: dict[str, tuple[Term, int]] = {}
+        """By ARC: (term, step) of the newest notice to its client."""
         self._arc_of: dict[str, str] = {}
-        """By grant that was published: the ARC that it was for."""
+        """The ARC of each published grant."""
         self._ended_by: dict[str, set[str]] = {}
         """By term: ARCs that its RCM has ended for good."""
         self._over: set[str] = set()
         """ARCs that their clients have ended."""
         self._granted: dict[str, tuple[str, list[str]]] = {}
-        """By ARC that runs, as its client has it: its grant and RCs."""
+        """Grant and RCs of each ARC that runs according to its client."""
         self._had: dict[str, set[str]] = {}
         """By grant: the RCs that have held it."""
         self._taken: set[str] = set()
-        """Grants that an RCM has ended, and not for a loss."""
+        """Grants that an RCM has ended other than for a loss."""
         self._taken_away: set[str] = set()
-        """Those of them that their clients were not to keep: neither given back nor handed over."""
+        """Grants of `_taken` that were neither released nor handed over."""
         self._protected: dict[str, tuple[float, float]] = {}
-        """By grant: when it was published first, and from when only operators were to preempt it then. (None of these
-        programs is one.)"""
+        """By grant: when it was first published, and the time then published from which only operators preempt it.
+        (None of these programs is an operator.)"""
         self.delayed = -math.inf
-        """Until when messages were late last: an RC that heard of a hold late has it end later, and says so."""
+        """The last time at which messages were late: RCs that learned of a hold late end it later, and report that."""
         self._interrupted: set[str] = set()
-        """Grants that have ended at an RC, and no other of the same ARC began there as they did."""
+        """Grants that ended at an RC without the beginning of another grant of the same ARC."""
         self._owner: dict[str, str] = {}
-        """By ARC: the client that was told last that it waits or runs."""
+        """By ARC: the client with the last notice that it waits or runs."""
         self._handed: dict[str, tuple[str, str]] = {}
-        """By ARC: its old client, and the grant that it had as it was handed over, until the new one is told how it
-        stands."""
+        """By ARC: its old client, and its grant at the hand-over, until the new client has a notice of its state."""
         self._dropped: dict[str, float] = {}
         """ARCs whose clients were taken for gone, and when."""
         self._places: dict[tuple[str, str], Place] = {}
-        self._heard: dict[str, tuple[Any, int]] = {}
+        self._obeyed: dict[str, tuple[Any, int]] = {}
         """By instance of an RC: the newest (term, seq)."""
         self._promised: dict[str, Any] = {}
         self._answers: dict[tuple[str, str], set[str]] = {}
-        """By instance and term: what it said to hold when it promised that."""
+        """By instance and term: the holds that the instance reported when it promised this term."""
         self._held: dict[str, set[str]] = {}
         self._ended: dict[str, set[str]] = {}
         self._since: dict[tuple[object, ...], float] = {}
-        """Since when each thing that may not last is so."""
+        """Start of each condition that must not last."""
         self._running: dict[Term, set[Grant]] = {}
         self._queued: dict[Term, dict[ArcId, Rank]] = {}
         self._believed: dict[str, Term] = {}
-        """By client: the highest term that it heard of a leader,"""
+        """By client: the highest term of a leader that it has received."""
         self._silent: dict[str, Ns] = {}
-        """and for how long it had heard none at the last look: as it goes back, it hears one."""
+        """By client: the time without a leader at the last look, because a client that goes back has just found one."""
         self._seen: dict[Term, int] = {}
-        """By term: how many instants its RCM had decided about as it was looked at."""
+        """By term: the number of instants that its RCM had decided at the last look."""
 
     def event(self, what: Mapping[str, Any]) -> None:
-        """A line of `zscout.trace`: at every event, what an RC may not do whatever it hears."""
+        """Check a line of `zscout.trace`: the promises that an RC keeps at every event, whatever it receives."""
         if what["do"] == "publish":
             ended = self._ended_by.setdefault(str(what["term"]), set())
-            self._look_who_is_preempted(what)
+            self._check_preemptions(what)
             self._taken |= {str(grant) for grant, outcome in what["ends"] if outcome not in LOSSES}
             kept = (*LOSSES, "released", "handed_over")
             self._taken_away |= {str(grant) for grant, outcome in what["ends"] if outcome not in kept}
@@ -129,7 +128,7 @@ class Promises:
                 for grant, arc, *_ in holders:
                     answer = self._answers.get((what["instances"].get(rc), str(what["term"])))
                     if grant[0] != what["term"] and answer is not None and str(grant) not in answer:
-                        self._broken(f"{rc} is said to hold {grant} of before, and had answered that it does not")
+                        self._broken(f"{rc} is published to hold {grant} of before, and had answered that it does not")
                     self._arc_of[str(grant)] = arc
                     if arc in ended:
                         self._broken(f"{rc} is held by {arc}, which the same RCM has ended")
@@ -138,14 +137,14 @@ class Promises:
             self._ended_by.setdefault(str(what["term"]), set()).add(what["arc"])
             return
         if what["do"] == "reopened":
-            # Its time went by while its RCs settled.
+            # Its time passed while its RCs settled.
             self._ended_by.get(str(what["term"]), set()).discard(what["arc"])
             return
         rc, instance, known = what["rc"], what["instance"], (what["term"], what["seq"])
-        before = self._heard.get(instance, known)
+        before = self._obeyed.get(instance, known)
         if known < before:
             self._broken(f"{rc} went back from {before} to {known}")
-        self._heard[instance] = max(known, before)
+        self._obeyed[instance] = max(known, before)
         promised = self._promised.get(instance, known[0])
         if known[0] < promised:
             self._broken(f"{rc} obeys {known[0]}, and has promised {promised}")
@@ -156,8 +155,8 @@ class Promises:
         begins, ends = held - self._held.get(instance, set()), self._held.get(instance, set()) - held
         for grant in begins:
             self._had.setdefault(grant, set()).add(rc)
-        go_on = {self._request_of(grant) for grant in begins}
-        self._interrupted |= {grant for grant in ends if self._request_of(grant) not in go_on}
+        continued = {self._request_of(grant) for grant in begins}
+        self._interrupted |= {grant for grant in ends if self._request_of(grant) not in continued}
         ended |= ends
         if again := held & ended:
             self._broken(f"{rc} holds {', '.join(sorted(again))} again")
@@ -165,32 +164,32 @@ class Promises:
         if what["do"] == "command" and str(what["grant"]) not in held:
             self._broken(f"{rc} obeyed a command under {what['grant']}, which it does not hold")
 
-    def _look_who_is_preempted(self, published: Mapping[str, Any]) -> None:
+    def _check_preemptions(self, published: Mapping[str, Any]) -> None:
         for grant, outcome in published["ends"]:
-            told, protected = self._protected.get(str(grant), (self._now(), math.inf))
+            first, protected = self._protected.get(str(grant), (self._now(), math.inf))
             since = self._now() - protected
-            if outcome == "preempted" and since > PROTECTED and told > self.delayed:
+            if outcome == "preempted" and since > PROTECTED and first > self.delayed:
                 self._broken(f"{grant} is preempted, though it was protected {since:.1f} s ago")
         for grant, *_, left, protected in chain.from_iterable(published["rcs"].values()):
             if protected is not None:
                 self._protected.setdefault(str(grant), (self._now(), self._now() + left - protected))
 
     def forget_client(self, name: str) -> None:
-        """It died: what it was promised was to that life."""
+        """The client died: its promises ended with its process."""
         self._believed.pop(name, None)
         self._silent.pop(name, None)
         self._places = {key: place for key, place in self._places.items() if key[0] != name}
 
-    def told(self, name: str, arc: OpenArc, term: Term, *, touched: bool) -> None:
-        """A client, which believes no term below `term`, has news of one of its requests. `touched`: a fault may be
-        felt by it or by the RCs that the request names."""
+    def notified(self, name: str, arc: OpenArc, term: Term, *, touched: bool) -> None:
+        """A client, which believes no term below `term`, has news of a request. `touched`: a fault may affect the
+        client or the RCs of the request."""
         full = f"{name}/{arc.id}"
-        known = self._told.get(full, arc._last)
+        known = self._newest.get(full, arc._last)
         if known[0] > term:
-            known = arc._last  # this client went back, as it may: see `look_who_went_back`
+            known = arc._last  # this client went back, as it may: see `check_reverted_clients`
         if arc._last != known and arc._last < max(known, (term, 0)):
             self._broken(f"{name} {arc.name} believes {arc._last} after {max(known, (term, 0))}")
-        self._told[full] = max(arc._last, known)
+        self._newest[full] = max(arc._last, known)
         was_over = full in self._over
         if arc.open:
             self._over.discard(full)
@@ -200,19 +199,19 @@ class Promises:
             self._broken(f"{name} {arc.name} was taken, and then refused: {arc.reason}")
         held, granted = self._granted.pop(full, ("", [])), ""
         if arc.outcome == "completed" and not held[0] and not was_over:
-            self._broken(f"{name} {arc.name} had its time, and was never told of it")
+            self._broken(f"{name} {arc.name} had its time, and its client never knew of it")
         if arc.grant is not None:
             granted = _written(arc.grant)
             self._granted[full] = granted, arc.rcs
         self._follow_hand_over(name, arc, held, touched=touched)
         set_aside = arc.state == "queued" and arc.outcome is None
         lost = (arc.outcome in LOSSES or granted not in ("", held[0]) or set_aside) and self._stood(*held)
-        # A direct program that has left does not come back: its client gives such a grant back.
+        # A direct program that has left does not return: its client releases such a grant.
         given_back = arc._unconfirmed is not None or (
             arc.direct and arc.why is not None and arc.why.code == ReasonCode.UNCONFIRMED
         )
         if (lost or arc.outcome == "client_lost") and not given_back and arc._unserved is None and not touched:
-            how = f"was granted anew {granted}" if granted else arc.outcome or "is told to wait"
+            how = f"was granted again {granted}" if granted else arc.outcome or "waits again"
             self._broken(f"{name} {arc.name} {how}, though no fault touched it: {arc.reason}")
         if arc._place is not None:
             before = self._places.setdefault((name, arc.id), arc._place)
@@ -224,16 +223,15 @@ class Promises:
             self._broken(f"{name} lives, and was dropped")
 
     def had_its_time(self, name: str, arc: OpenArc, rcs: Sequence[str], ready: Collection[float | None]) -> None:
-        """A hold that no fault touched ends after its time. `ready`: since when each of its slow devices could be
-        used."""
+        """A hold that no fault touched ends after its time. `ready`: when each of its slow devices became usable."""
         since = max((self._now() if at is None else at for at in ready), default=-math.inf)
         had = self._now() - since
         if had < float(arc.min_runtime) - UNUSED:
             asked = f"{had:.1f} of {arc.min_runtime} s"
-            self._broken(f"{name} {arc.name} could use {' '.join(rcs)} for {asked}: the rest it lost to their start")
+            self._broken(f"{name} {arc.name} could use {' '.join(rcs)} for {asked}: it lost the rest to their start")
 
     def _follow_hand_over(self, name: str, arc: OpenArc, held: tuple[str, list[str]], *, touched: bool) -> None:
-        """What the old client held as it let go, the new one holds, unless it was taken by an RCM that knew of it."""
+        """Check that the new client holds what the old client handed over, unless an RCM that knew of it took it."""
         grant, rcs = held
         if arc.state == "moved":
             had = rcs and self._had.get(grant, set()).issuperset(rcs)
@@ -247,11 +245,11 @@ class Promises:
                 self._broken(f"{name} {arc.name} was held as it was handed over, and is not: {arc.reason}")
 
     def _request_of(self, grant: str) -> str:
-        """The id that its client gave it, whoever that is."""
+        """The request id of the grant's ARC, which is the same at any client."""
         return self._arc_of.get(grant, grant).split("/")[-1]
 
     def _stood(self, grant: str, rcs: Sequence[str]) -> bool:
-        """Whether this was a hold that went on: all of its RCs had it, and no RCM ended it but for a loss."""
+        """Return True if this hold was in force: all its RCs held it, and no RCM ended it other than for a loss."""
         return bool(rcs) and grant not in self._taken and self._had.get(grant, set()).issuperset(rcs)
 
     def look(
@@ -264,9 +262,9 @@ class Promises:
         calm: bool,
         lasting: Mapping[tuple[object, ...], float],
     ) -> None:
-        """What must be so at any time, of processes that do not stand still. `silence`: for how long each RC that goes
-        on has heard no RCM, by its own clock. `calm`: there is no fault now. `lasting`: what else may not last, and how
-        long it may."""
+        """Check the conditions that hold at any time, for processes that are not stopped. `silence`: time since each
+        running RC last received a publication, by its own clock. `calm`: there is no fault now. `lasting`: further
+        conditions that must not last, with their longest times."""
         for rcm in leaders.values():
             if self.terms.setdefault(rcm.term, self._now()) == self._now() and not self.unheard:
                 self._begun.append(self._now())
@@ -281,23 +279,24 @@ class Promises:
         if calm:
             come_right = (*_left(leaders, rcs), *_worse_places(clients, leaders), *self._given_up(rcs))
             lasting |= dict.fromkeys(come_right, COME_RIGHT)
-            lasting |= dict.fromkeys((*_doubles(rcs), *_at_odds(leaders, rcs)), SAID)
+            lasting |= dict.fromkeys((*_doubles(rcs), *_at_odds(leaders, rcs)), IN_AGREEMENT_WITHIN)
         self._since = {key: self._since.get(key, self._now()) for key in lasting}
         for key, longest in lasting.items():
             if self._now() - self._since[key] > longest:
                 self._broken(f"for more than {longest:g} s: {' '.join(map(str, key))}")
 
-    def look_who_went_back(self, clients: Mapping[str, Client], silence: Mapping[str, Ns]) -> None:
-        """A client may go back from a term that it only promised, or after a hold lease of `silence`."""
+    def check_reverted_clients(self, clients: Mapping[str, Client], silence: Mapping[str, Ns]) -> None:
+        """A client may return to a lower term only from a term that it only promised, or after a hold lease of
+        `silence`."""
         for name, client in clients.items():
             term, before = client.internals.term, self._believed.get(name, NO_TERM)
             self._believed[name] = client.internals.rcm._heard
             silent, self._silent[name] = self._silent.get(name, 0), silence[name]
             if term < before and silent / SECOND < self._hold_lease - JUST_NOW:
-                self._broken(f"{name} went back from {before} to {term}, and had heard that lately")
+                self._broken(f"{name} went back from {before} to {term}, though that leader published recently")
 
-    def look_who_leads_again(self, leaders: Mapping[str, Rcm]) -> None:
-        """A node whose disk was not emptied leads in no term below one in which it led."""
+    def check_leaders_terms(self, leaders: Mapping[str, Rcm]) -> None:
+        """A node whose disk was not emptied never leads in a lower term than before."""
         for name, rcm in leaders.items():
             before = self.led.get(name, NO_TERM)
             if rcm.term < before:
@@ -305,14 +304,14 @@ class Promises:
             self.led[name] = max(rcm.term, before)
 
     def _in_order(self, rcm: Rcm) -> None:
-        """Of two that wait, the better-ranked is granted first, if it needs no more than what the other got."""
+        """Of two waiting ARCs the better-ranked is granted first, if it needs no other RCs."""
         if self._seen.get(rcm.term) == rcm.core.batches:
             return
         self._seen[rcm.term] = rcm.core.batches
         running, queued = self._running.get(rcm.term, set()), self._queued.get(rcm.term, {})
         status = rcm.core.status()
         granted = [arc for arc in status.running if arc.hold and arc.hold.grant not in running and arc.id in queued]
-        # Who was taken for gone meanwhile has waited only since.
+        # An ARC whose client was taken for gone has waited only since then.
         waited = [
             arc
             for arc in status.queued
@@ -342,8 +341,8 @@ class Promises:
         faults: Sequence[tuple[float, float]],
         excused: Collection[str] = (),
     ) -> None:
-        """Everything was served, and `LEFT_OVER` is over. `faults`: when each began and was over; `excused`: clients
-        that wait for good reason."""
+        """Check the end: everything was served, and `LEFT_OVER` has passed. `faults`: beginning and end of each;
+        `excused`: clients that may still wait."""
         for at in self._begun:
             terms = sum(at <= other < at + TERMS_WITHIN for other in self._begun)
             felt = sum(begin < at + TERMS_WITHIN and end > at for begin, end in faults)
@@ -360,7 +359,7 @@ class Promises:
 
 
 def _written(grant: Grant) -> str:
-    """As a trace has it."""
+    """The grant as written in a trace."""
     return str([[*grant.term], grant.seq])
 
 
@@ -369,7 +368,7 @@ def _rank(arc: ArcStatus) -> Rank:
 
 
 def _is_next(arc: ArcStatus) -> bool:
-    """Whether it waits for nothing but what others hold."""
+    """Return True if it waits only for RCs that others hold."""
     return arc.reported is None or arc.reported.code is ReasonCode.HELD
 
 
@@ -382,33 +381,33 @@ def _half_gangs(clients: Mapping[str, Client], rcs: Mapping[str, ResourceControl
 
 
 def _at_odds(leaders: Mapping[str, Rcm], rcs: Mapping[str, ResourceController]) -> Iterator[tuple[object, ...]]:
-    """RCs that hold something else than the RCM says that they obey."""
+    """RCs whose holds differ from those of the RCM that they obey."""
     for rcm in leaders.values():
         for rc in rcs.values():
             if rc.holds.term == rcm.term and rc.instances.state is InstanceState.SERVES:
                 known = {arc.hold.grant for arc in rcm.core.holders(rc.name) if arc.hold is not None}
                 for grant in known ^ rc.holds.held.keys():
-                    yield rc.name, "holds" if grant in rc.holds.held else "lacks", grant, "against its RCM's word"
+                    yield rc.name, "holds" if grant in rc.holds.held else "lacks", grant, "unlike its RCM's state"
 
 
 def _unled(rcs: Mapping[str, ResourceController], silence: Mapping[str, Ns]) -> Iterator[tuple[object, ...]]:
     for key, span in silence.items():
         if rcs[key].holds.held and span > rcs[key].holds.hold_lease:
-            yield key, "is held, and has heard no RCM for the hold lease"
+            yield key, "is held, though no RCM published for the hold lease"
 
 
 def _doubles(rcs: Mapping[str, ResourceController]) -> Iterator[tuple[object, ...]]:
     held = Counter(rc.name for rc in rcs.values() if rc.holds.held)
     for name, instances in held.items():
         if instances > 1:
-            yield name, "is held in several instances"
+            yield name, "has several instances with holders"
 
 
 def _left(leaders: Mapping[str, Rcm], rcs: Mapping[str, ResourceController]) -> Iterator[tuple[object, ...]]:
     for host, rcm in leaders.items():
         shunned = rcm.roster.shunned
         if any(rc.holds.term > rcm.term and rc.instance not in shunned for rc in rcs.values()):
-            yield host, "leads in", rcm.term, "though an RC obeys a higher one"
+            yield host, "leads in", rcm.term, "though an RC obeys a higher term"
 
 
 def _worse_places(clients: Mapping[str, Client], leaders: Mapping[str, Rcm]) -> Iterator[tuple[object, ...]]:
@@ -417,4 +416,4 @@ def _worse_places(clients: Mapping[str, Client], leaders: Mapping[str, Rcm]) -> 
             for rcm in leaders.values():
                 known = rcm.core.arc(f"{name}/{arc.id}")
                 if known is not None and arc._place is not None and known.place > arc._place:
-                    yield name, arc.name, "is at a worse place than it was told, in", rcm.term
+                    yield name, arc.name, "is at a worse place than its client knows, in", rcm.term

@@ -439,9 +439,9 @@ class Simulation:
             if self.size.forger:
                 for why in filter(None, map(forgers.believed, self._leaders().values())):
                     self.broken(f"a leader believes a forger: {why}")
-            self.promises.look_who_went_back(clients, unled)
+            self.promises.check_reverted_clients(clients, unled)
             if self.size.liars:
-                self.promises.look_who_leads_again(self._leaders())
+                self.promises.check_leaders_terms(self._leaders())
             if self.work.over and not any(self.busy.values()):
                 self.idle.set()
 
@@ -645,7 +645,7 @@ class Simulation:
             self.booked.news(arc, self._leading_hosts())
             grant, since, rcs = began.get(arc.id, (None, 0.0, []))
             touched = self.excuses.felt(since, name, *rcs, *arc.rcs, *arc.needs)
-            self.promises.told(name, arc, client.internals.term, touched=touched)
+            self.promises.notified(name, arc, client.internals.term, touched=touched)
             slow = [self.devices[rc] for rc in rcs if self.devices[rc].starts]
             if slow and grant is not None and arc.grant is None:
                 del began[arc.id]
