@@ -322,7 +322,7 @@ def main(file: Path | None, check: bool, log_level: str) -> None:
     """Run this host's part of a fleet, as configured by the node FILE (TOML).
 
     Without FILE, the node may lead the fleet "zscout" and reports the host's load. `zscout simulate --node lab.toml`
-    writes a node file for a simulated building; docs/reference/configuration.md lists all settings.
+    writes a node file for a simulated building; docs/reference/node-file.md lists all settings.
 
     \b
     Examples:

@@ -1,4 +1,4 @@
-"""docs/reference/configuration.md names every key of the fleet and the node file, with its default."""
+"""docs/reference/configuration.md and node-file.md name every key of the fleet and the node file, with its default."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from msgspec import inspect
 from tests.surface.files import known
 from zscout.config import fleet, node
 
-REFERENCE = (Path(__file__).parents[2] / "docs" / "reference" / "configuration.md").read_text()
-FLEET, NODE = REFERENCE.split("\n## Node file\n")
+REFERENCE = Path(__file__).parents[2] / "docs" / "reference"
+FLEET, NODE = ((REFERENCE / name).read_text() for name in ("configuration.md", "node-file.md"))
 
 
 def documented(text: str) -> dict[str, str]:
     """`table.key`: the default as it is written."""
     found: dict[str, str] = {}
-    for section in re.split(r"^### ", text, flags=re.MULTILINE)[1:]:
+    for section in re.split(r"^## ", text, flags=re.MULTILINE)[1:]:
         table = section[: section.index("\n")].partition("]")[0].strip("[")
         for row in re.findall(r"^\| (`\w+` \|.*) \|$", section, re.MULTILINE):
             key, default, _unit, _meaning, example = (cell.strip(" `") for cell in row.split("|"))
