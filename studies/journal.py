@@ -14,7 +14,7 @@ from decimal import Decimal
 from pathlib import Path
 
 from zscout.messages import MAX_PAGE, Grants, HistoryAsk, Holder, Revocation, Who, encode
-from zscout.services.journal.follower import Change, Follower, Heard, PublicationHeard, UseHeard
+from zscout.services.journal.follower import Change, Follower, Observation, PublicationReceived, UseReported
 from zscout.services.journal.store import JournalStore
 from zscout.types import Grant, Place, Term
 
@@ -29,7 +29,7 @@ SIZE = 10**9
 AGE = 3.2e7
 
 
-def publications(count: int, *, used: bool) -> Iterator[tuple[float, list[Heard]]]:
+def publications(count: int, *, used: bool) -> Iterator[tuple[float, list[Observation]]]:
     """For each hold when it began, and what is heard of it."""
     for number in range(count):
         at, seq, client = START + APART * number, 2 * number + 1, f"ws{number % 20}/request-0123456789ab"
@@ -43,8 +43,8 @@ def publications(count: int, *, used: bool) -> Iterator[tuple[float, list[Heard]
         over = Revocation(name, arc, client, grant, rcs, "completed", "its minimum runtime is over")
         free: dict[str, list[Holder]] = {rc: [] for rc in rcs}
         ends = Grants(TERM, seq + 1, seq, 0.5, free, [over], instances)
-        heard: list[Heard] = [PublicationHeard(at, 0.2, begins), PublicationHeard(at + 30, 0.2, ends)]
-        yield at, heard + ([UseHeard([(rc, grant, 27.125) for rc in rcs])] if used else [])
+        heard: list[Observation] = [PublicationReceived(at, 0.2, begins), PublicationReceived(at + 30, 0.2, ends)]
+        yield at, heard + ([UseReported([(rc, grant, 27.125) for rc in rcs])] if used else [])
 
 
 def fill(store: JournalStore, count: int, *, used: bool) -> tuple[list[float], list[float]]:

@@ -14,7 +14,7 @@ from tests.mesh.kit import until
 from zscout import messages
 from zscout.keyexpr import BadName
 from zscout.mesh import IncomingQuery, Mesh, MeshError, Refused, Tally
-from zscout.mesh.session import MAX_OF_ONE_KEY
+from zscout.mesh.session import MAX_REPLIES_PER_KEY
 from zscout.mesh.transport import Collector
 
 PING = Ping()
@@ -230,7 +230,7 @@ async def test_of_the_answers_of_one_key_the_first_are_read(world: World, monkey
 
     monkeypatch.setattr(a._transport, "get", get)
     replies = await a.ask("test/*", PING, Pong, timeout=LONG)
-    assert Counter(reply.key for reply in replies) == dict.fromkeys(keys, MAX_OF_ONE_KEY)
+    assert Counter(reply.key for reply in replies) == dict.fromkeys(keys, MAX_REPLIES_PER_KEY)
 
 
 async def test_ask_ends_with_the_reply_that_is_enough(world: World) -> None:

@@ -72,7 +72,7 @@ class _World:
     def meeting(self) -> zenoh.Config:
         """For a session by which the first peer is introduced to others."""
         settings = zenoh_config(replace(self._config, multicast=False, connect=tuple(self._connect)))
-        settings.insert_json5("id", f'"{relinking.MEETING}01"')
+        settings.insert_json5("id", f'"{relinking.TEMPORARY_ID}01"')
         return settings
 
     async def peer(
@@ -113,7 +113,7 @@ async def test_a_link_that_came_and_went_without_a_word_is_made_again(
     stack: AsyncExitStack, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Zenoh tells of some that come that they do, and not that they are gone."""
-    monkeypatch.setattr(relinking, "PAUSES", (0.5, *relinking.PAUSES))
+    monkeypatch.setattr(relinking, "ATTEMPT_PAUSES", (0.5, *relinking.ATTEMPT_PAUSES))
 
     here, there = await _World(stack).pair()
     looking = here._relinking
@@ -136,7 +136,7 @@ async def test_who_lost_two_links_made_by_others_sees_to_both(
 
     monkeypatch.setattr(relinking, "_listens", listens)
     # However late this process comes to cut the second.
-    monkeypatch.setattr(relinking, "TOGETHER", WITHIN)
+    monkeypatch.setattr(relinking, "SIMULTANEOUS", WITHIN)
 
     world = _World(stack)
     await world.peer()
@@ -199,7 +199,7 @@ async def test_who_listens_and_is_not_found_is_asked_once_whether_it_does(
     stack: AsyncExitStack, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Each connection that is closed unused keeps others from a TLS listener for a while."""
-    monkeypatch.setattr(relinking, "PAUSES", (0.01,) * 5)
+    monkeypatch.setattr(relinking, "ATTEMPT_PAUSES", (0.01,) * 5)
     monkeypatch.setattr(relinking, "SCOUT_TIMEOUT", 0.05)
 
     here = (await _World(stack).peer(relinks=True))._relinking

@@ -12,7 +12,7 @@ from tests.mesh.both_meshes import ASK, LONG, NEWS, Ping, Pong, World, token
 from tests.mesh.kit import until
 from zscout.keyexpr import Role, Sender, Token
 from zscout.mesh import MeshError
-from zscout.mesh.renewal import LASTS, LONGEST, OVERLAP, PATIENCE, SHORTEST, RenewableTransport, Suspicions
+from zscout.mesh.renewal import FORGET_AFTER, MAX_PAUSE, MIN_PAUSE, OVERLAP, PATIENCE, RenewableTransport, Suspicions
 from zscout.mesh.transport import Transport
 from zscout.testing.memory import MemoryNetwork
 from zscout.types import SECOND
@@ -195,15 +195,15 @@ def test_a_contradiction_must_last_and_one_that_stays_is_acted_on_ever_more_seld
     suspicions.suspect("x", so=False)
     seconds += PATIENCE
     suspicions.suspect("x")
-    seconds += LASTS
+    seconds += FORGET_AFTER
     suspicions.suspect("x")
     assert renewed == []
     while seconds < 2_000:
         seconds += 0.5
         suspicions.suspect("x")
     pauses = [after - before for before, after in itertools.pairwise(renewed)]
-    assert pauses[:3] == [SHORTEST, 2 * SHORTEST, 4 * SHORTEST]
-    assert max(pauses) == pauses[-1] == LONGEST
+    assert pauses[:3] == [MIN_PAUSE, 2 * MIN_PAUSE, 4 * MIN_PAUSE]
+    assert max(pauses) == pauses[-1] == MAX_PAUSE
 
 
 def test_what_was_set_right_and_is_wrong_again_does_not_wait_longer() -> None:
@@ -218,4 +218,4 @@ def test_what_was_set_right_and_is_wrong_again_does_not_wait_longer() -> None:
         suspicions.keep(["b x"] if wrong else [], "b ")
         if wrong:
             suspicions.suspect("b x")
-    assert {after - before for before, after in itertools.pairwise(renewed)} == {SHORTEST}
+    assert {after - before for before, after in itertools.pairwise(renewed)} == {MIN_PAUSE}

@@ -14,7 +14,7 @@ from tests.hang import HANG
 from zscout.keyexpr import BadName
 from zscout.mesh import supervision
 from zscout.mesh.exchange import Refused
-from zscout.mesh.supervision import AFTERMATH, StallWatch, Supervisor, done_within, supervised
+from zscout.mesh.supervision import AFTERMATH_NS, StallWatch, Supervisor, done_within, supervised
 from zscout.testing.virtual_time import VirtualTimeLoop
 from zscout.types import SECOND, Ns
 
@@ -342,7 +342,7 @@ async def test_a_stall_is_measured_and_soon_over() -> None:
     assert watch.fresh()
     arrived = _now()
     assert watch.waited_through(arrived) == pytest.approx(2.8 * SECOND, rel=0.001)
-    await asyncio.sleep(AFTERMATH / SECOND + 0.01)
+    await asyncio.sleep(AFTERMATH_NS / SECOND + 0.01)
     assert not watch.fresh()
     assert watch.waited_through(_now()) == 0
     assert watch.waited_through(arrived) > 0

@@ -28,7 +28,7 @@ from zscout.drivers.use import UseCounter
 from zscout.drivers.work_queue import COMMANDS_PER_HOST, WorkQueue
 from zscout.keyexpr import Role, Token, new_instance
 from zscout.mesh import Declaration, IncomingQuery, Mesh, Refused, Reply, Supervisor, Tally
-from zscout.mesh.renewal import UNHEARD
+from zscout.mesh.renewal import SILENT_RCM_PATIENCE
 from zscout.mesh.supervision import Alarm, StallWatch
 from zscout.mesh.terms import LastTerms
 from zscout.scheduling.reason import starting
@@ -795,7 +795,9 @@ class ResourceController:
         """Suspect the mesh if a leader's token, its publications or its queries are missing while another of them
         arrives: then declarations did not reach the other side. Also if candidates are seen and none leads in time."""
         silent = bool(self._leaders) and not self._receives
-        self.mesh.suspicions.suspect(f"{self.name}: an RCM is seen that does not publish", so=silent, patience=UNHEARD)
+        self.mesh.suspicions.suspect(
+            f"{self.name}: an RCM is seen that does not publish", so=silent, patience=SILENT_RCM_PATIENCE
+        )
         signs = {
             f"{self.name}: the RCM publishes and is not seen": self._receives and not self._leaders,
             f"{self.name}: the RCM publishes and has not asked for its promise": self._receives

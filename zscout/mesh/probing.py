@@ -29,7 +29,7 @@ from zscout.config.fleet import MeshConfig, ip_of
 from zscout.config.strict import BadInput, Where
 from zscout.keyexpr import NAME, ROOT, Role
 from zscout.mesh.exchange import MeshError
-from zscout.mesh.relinking import MEETING
+from zscout.mesh.relinking import TEMPORARY_ID
 from zscout.mesh.zenoh_mesh import check_room, in_thread, open_session, zenoh_config
 from zscout.types import clean
 
@@ -102,7 +102,7 @@ async def heard(config: MeshConfig) -> list[Heard]:
             while time.monotonic() < until and len(found) < MAX_HEARD:
                 if (hello := scout.try_recv()) is None:
                     await asyncio.sleep(POLL)
-                elif not (zid := str(hello.zid)).startswith(MEETING):
+                elif not (zid := str(hello.zid)).startswith(TEMPORARY_ID):
                     hosts = {at: match[2].strip("[]") for at in hello.locators if (match := _ADDRESS.match(at))}
                     # Every host has loopback: it identifies and reaches a process only if that has no other address.
                     beyond = {at: host for at, host in hosts.items() if host not in LOOPBACKS} or hosts
@@ -259,7 +259,7 @@ def plain_fleets(addresses: Sequence[str]) -> dict[str, set[str]]:
     """Fleets found at these addresses without TLS, each with its hosts that have a node. Blocks for at most 2 s."""
     settings: dict[str, object] = {
         "mode": "peer",
-        "id": f"{MEETING}{secrets.token_hex(10)}",
+        "id": f"{TEMPORARY_ID}{secrets.token_hex(10)}",
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": False,
         "listen/endpoints": [],

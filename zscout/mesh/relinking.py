@@ -24,16 +24,18 @@ from zenoh.handlers import Callback
 
 log = logging.getLogger(__name__)
 
-PAUSES: Final = (0.02, 0.1, 0.1, 0.2, 0.2, 0.5, *(1.0,) * 30)  # seconds before each attempt; then only Zenoh tries
-TOGETHER: Final = 0.25  # two losses within these seconds mean that this process was cut off: it looks for all peers
-LOOKS_FOR_GREATER: Final = 4  # attempts for peers with a greater id; few, as many processes may try at once
+ATTEMPT_PAUSES: Final = (0.02, 0.1, 0.1, 0.2, 0.2, 0.5, *(1.0,) * 30)
+"""Seconds before each attempt; after the last one only Zenoh tries."""
+SIMULTANEOUS: Final = 0.25
+"""Seconds between two losses that mean that this process was cut off: then it looks for all peers."""
+GREATER_ID_ATTEMPTS: Final = 4  # attempts for peers with a greater id; few, as many processes may try at once
 PROBE_TIMEOUT: Final = 0.25
 PROBES_TIMEOUT: Final = 1.0  # seconds for all probes of one attempt
 SCOUT_TIMEOUT: Final = 0.5
 GREET_TIMEOUT: Final = 0.1
 MEET_TIMEOUT: Final = 0.25  # seconds; a peer that has not noticed the loss accepts no second link
 POLL: Final = 0.002
-MEETING: Final = "6d656574"  # prefix of the ids of temporary sessions, whose end is ignored
+TEMPORARY_ID: Final = "6d656574"  # prefix of the ids of temporary sessions, whose end is ignored
 _ADDRESS: Final = re.compile(r"^(?:tcp|tls)/(.+):(\d+)(?:[?#].*)?$")
 
 
@@ -41,7 +43,7 @@ _ADDRESS: Final = re.compile(r"^(?:tcp|tls)/(.+):(\d+)(?:[?#].*)?$")
 class _Lost:
     at: float
     addresses: list[str] = field(default_factory=list)  # on which the peer listens
-    looks: int = 0
+    attempts: int = 0
     listens: bool | None = None  # once True not probed again: an unused connection blocks a TLS listener for 0.1 s
     together: bool = False  # True if this process looks for the peer though the peer makes the link
 
@@ -91,16 +93,16 @@ class Relinking:
     def _on_link(self, event: zenoh.LinkEvent) -> None:
         now, peer = time.monotonic(), str(event.link.zid)
         with self._lock:
-            if event.kind == zenoh.SampleKind.PUT or self._closed.is_set() or peer.startswith(MEETING):
+            if event.kind == zenoh.SampleKind.PUT or self._closed.is_set() or peer.startswith(TEMPORARY_ID):
                 return  # `_try_all` sees new links: they may vanish without another event
             if peer in self._routers:
                 self._routers.remove(peer)
                 return
             self._lost.setdefault(peer, _Lost(now)).addresses.append(event.link.dst)
-            recent = [lost for lost in self._lost.values() if now - lost.at < TOGETHER]
+            recent = [lost for lost in self._lost.values() if now - lost.at < SIMULTANEOUS]
             for lost in recent:
                 if len(recent) > 1 and not lost.together:
-                    lost.together, lost.looks = True, 0
+                    lost.together, lost.attempts = True, 0
             if self._thread is None:
                 self._begin(greet=False)
 
@@ -137,10 +139,10 @@ class Relinking:
     def _next(self) -> float | None:
         """Seconds until the next attempt; None if no link is lost."""
         with self._lock:
-            still = {peer: lost for peer, lost in self._lost.items() if lost.looks < len(PAUSES)}
+            still = {peer: lost for peer, lost in self._lost.items() if lost.attempts < len(ATTEMPT_PAUSES)}
             self._lost = {} if self._closed.is_set() else still
             if self._lost:
-                return min(PAUSES[lost.looks] for lost in self._lost.values())
+                return min(ATTEMPT_PAUSES[lost.attempts] for lost in self._lost.values())
             self._thread = None
             return None
 
@@ -149,20 +151,21 @@ class Relinking:
         with self._lock:
             # A peer just lost may still be listed as linked.
             self._lost = {
-                peer: link for peer, link in self._lost.items() if peer not in linked or now - link.at < TOGETHER
+                peer: link for peer, link in self._lost.items() if peer not in linked or now - link.at < SIMULTANEOUS
             }
             lost = {peer: link for peer, link in self._lost.items() if peer not in linked}
         wanted, until = set(), time.monotonic() + PROBES_TIMEOUT
-        for peer, link in sorted(lost.items(), key=lambda known: known[1].looks):
+        for peer, link in sorted(lost.items(), key=lambda known: known[1].attempts):
             if time.monotonic() > until or self._closed.is_set():
                 break
-            link.looks += 1
+            link.attempts += 1
             link.listens = link.listens or _listens(link.addresses)
-            if link.listens or (link.together and link.looks <= LOOKS_FOR_GREATER):
+            if link.listens or (link.together and link.attempts <= GREATER_ID_ATTEMPTS):
                 wanted.add(peer)
-            elif link.listens is False and time.monotonic() - link.at >= TOGETHER:
-                # The peer's process ended, or the peer makes the link. Before TOGETHER is over another loss may follow.
-                link.looks = len(PAUSES)
+            elif link.listens is False and time.monotonic() - link.at >= SIMULTANEOUS:
+                # The peer's process ended, or the peer makes the link. Until SIMULTANEOUS is over,
+                # another loss may follow.
+                link.attempts = len(ATTEMPT_PAUSES)
         if wanted and not self._closed.is_set():
             there = self._scout(SCOUT_TIMEOUT, wanted)
             if self._own in there and len(there) > 1:
@@ -188,7 +191,7 @@ class Relinking:
     def _introduce(self, there: dict[str, list[str]]) -> None:
         addresses = [address for known in there.values() for address in known]
         peers, settings = there.keys() - {self._own}, self._meeting(addresses)
-        settings.insert_json5("id", f'"{MEETING}{secrets.token_hex(10)}"')
+        settings.insert_json5("id", f'"{TEMPORARY_ID}{secrets.token_hex(10)}"')
         with zenoh.open(settings):
             until = time.monotonic() + MEET_TIMEOUT
             while time.monotonic() < until and not self._closed.wait(POLL):

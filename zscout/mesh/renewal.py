@@ -20,13 +20,13 @@ from zscout.types import SECOND, Ns
 log = logging.getLogger(__name__)
 
 PATIENCE: Final = 2.0  # seconds for which a contradiction must last
-UNHEARD: Final = 0.5  # seconds that a live RCM may be silent beyond half a hold lease: holds must not lapse
-LASTS: Final = 60.0  # seconds after which a contradiction is forgotten unless reported again
+SILENT_RCM_PATIENCE: Final = 0.5  # seconds that a live RCM may be silent beyond half a hold lease: holds must not lapse
+FORGET_AFTER: Final = 60.0  # seconds after which a contradiction is forgotten unless reported again
 OVERLAP: Final = 0.5  # seconds with both sessions open, for others to learn the declarations of the new one
-MOST_OVERLAPS: Final = 3  # overlaps to wait for each peer of the old session to have a link to the new one
-LINKED: Final = 2.0  # seconds for the new session to link to the peers of the old one
+MAX_OVERLAPS: Final = 3  # overlaps to wait for each peer of the old session to have a link to the new one
+LINK_TIMEOUT: Final = 2.0  # seconds for the new session to link to the peers of the old one
 LOOK_EVERY: Final = 0.02
-SHORTEST, LONGEST = 10.0, 320.0  # seconds between renewals, doubled while a contradiction outlives them
+MIN_PAUSE, MAX_PAUSE = 10.0, 320.0  # seconds between renewals, doubled while a contradiction outlives them
 
 OnToken: TypeAlias = Callable[[str, bool], None]
 Opening: TypeAlias = Callable[[], Awaitable[Transport]]
@@ -39,7 +39,7 @@ class Suspicions:
         self._now, self._renew = now, renew
         self._since: dict[str, tuple[Ns, Ns]] = {}  # first and last report of each
         self._last: Ns | None = None
-        self._pause = SHORTEST
+        self._pause = MIN_PAUSE
         self._acted: dict[str, Ns] = {}  # last renewal for each unresolved contradiction
 
     @property
@@ -54,18 +54,18 @@ class Suspicions:
             self._acted.pop(what, None)
             return
         now = self._now()
-        self._since = {key: seen for key, seen in self._since.items() if now - seen[1] < LASTS * SECOND}
+        self._since = {key: seen for key, seen in self._since.items() if now - seen[1] < FORGET_AFTER * SECOND}
         first, _ = self._since.get(what, (now, now))
         self._since[what] = first, now
         if now - first < patience * SECOND:
             return
-        self._acted = {key: at for key, at in self._acted.items() if now - at < 10 * LONGEST * SECOND}
+        self._acted = {key: at for key, at in self._acted.items() if now - at < 10 * MAX_PAUSE * SECOND}
         if self._last is not None:
             helped = what not in self._acted
-            if now - self._last < (SHORTEST if helped else self._pause) * SECOND:
+            if now - self._last < (MIN_PAUSE if helped else self._pause) * SECOND:
                 return
             calm = now - self._last > 10 * self._pause * SECOND
-            self._pause = SHORTEST if helped or calm else min(LONGEST, 2 * self._pause)
+            self._pause = MIN_PAUSE if helped or calm else min(MAX_PAUSE, 2 * self._pause)
         self._last = self._acted[what] = now
         self._since.clear()
         log.warning("%s: reopening the mesh session", what)
@@ -117,7 +117,7 @@ class RenewableTransport(Transport):
                     for declared in self._all():
                         declared.declare(fresh)
                     # A peer may meanwhile link to the old one: after a new network, or a renewal of the peer.
-                    for _ in range(MOST_OVERLAPS):
+                    for _ in range(MAX_OVERLAPS):
                         known = {*fresh.peers(), fresh.id()}
                         await asyncio.sleep(OVERLAP)
                         await self._linked(old, fresh)
@@ -140,9 +140,9 @@ class RenewableTransport(Transport):
             self.renew()
 
     async def _linked(self, old: Transport, fresh: Transport) -> None:
-        """Wait until `fresh` has links to all peers of `old`, at most LINKED seconds."""
+        """Wait until `fresh` has links to all peers of `old`, at most LINK_TIMEOUT seconds."""
         # Polled: Zenoh reports no new links, and listing them is cheap.
-        tries = round(LINKED / LOOK_EVERY)
+        tries = round(LINK_TIMEOUT / LOOK_EVERY)
         while tries and not set(old.peers()) <= {*fresh.peers(), fresh.id()}:
             tries -= 1
             await asyncio.sleep(LOOK_EVERY)
@@ -357,7 +357,7 @@ class _TokenView:
         return undeclare
 
     def _forget(self, session: int) -> None:
-        """Report tokens that session number `session` has not reported as gone."""
+        """Report as gone the tokens that session number `session` has not shown."""
         with self._lock:
             for token in [token for token, shown in self._alive.items() if shown < session]:
                 del self._alive[token]

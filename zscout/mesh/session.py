@@ -48,7 +48,7 @@ BURST_S = 0.02  # seconds after which a burst ends: timers and other services ru
 SHARE = 16  # queries of one host in the common queue; its surplus waits until the common queue is empty
 RING_DEPTH = 32
 KEPT_BY_KEY = 16  # waiting publications on one key if only the newest counts; then the newest replaces the last
-MAX_OF_ONE_KEY = 8  # answers read per key and query, such as from the processes of one host
+MAX_REPLIES_PER_KEY = 8  # answers read per key and query, such as from the processes of one host
 LINK_PERIOD = 1.0  # seconds between two checks that each linked session's token is visible
 MAX_SESSIONS = 4_096  # sessions remembered
 FINAL_SLACK = 0.5  # seconds after its timeout at which a query ends without the transport's report
@@ -283,7 +283,7 @@ class Mesh:
 
         def on_reply(of: str, payload: bytes, ok: bool) -> bool:
             answers[of] = answers.get(of, 0) + 1
-            if of and answers[of] > MAX_OF_ONE_KEY:
+            if of and answers[of] > MAX_REPLIES_PER_KEY:
                 return False
             reply = self._read_reply(of or key, payload, ok, kind, limit)
             if reply is None:

@@ -18,9 +18,9 @@ from zscout.types import SECOND, Ns
 log = logging.getLogger(__name__)
 
 CLOSE_TIMEOUT = 5.0  # seconds that `close` waits for cancelled tasks
-STALL_PERIOD = 0.2  # seconds between two readings of the clock
-STALL_THRESHOLD = SECOND // 5  # ns by which a reading is late that means a stall
-AFTERMATH = SECOND // 4  # ns after a stall within which an arrival may have waited through it
+STALL_PERIOD_S = 0.2  # seconds between two readings of the clock
+STALL_THRESHOLD_NS = SECOND // 5  # ns by which a reading is late that means a stall
+AFTERMATH_NS = SECOND // 4  # ns after a stall within which an arrival may have waited through it
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -194,7 +194,7 @@ class StallWatch:
 
     def start(self) -> Self:
         self._last = self._now()
-        self._timer = asyncio.get_running_loop().call_later(STALL_PERIOD, self._sample_clock)
+        self._timer = asyncio.get_running_loop().call_later(STALL_PERIOD_S, self._sample_clock)
         return self
 
     def stop(self) -> None:
@@ -204,8 +204,8 @@ class StallWatch:
     def check(self) -> None:
         """Record a stall that has just ended."""
         now = self._now()
-        gap = now - self._last - round(STALL_PERIOD * SECOND)
-        if gap > STALL_THRESHOLD:
+        gap = now - self._last - round(STALL_PERIOD_S * SECOND)
+        if gap > STALL_THRESHOLD_NS:
             self.length, self.ended = gap, now
             log.warning("process stalled for %.2f s", gap / SECOND)
         self._last = now
@@ -213,13 +213,13 @@ class StallWatch:
     def waited_through(self, arrived: Ns) -> Ns:
         """How long (ns) a stall may have delayed an item before this process received it, at `arrived`."""
         self.check()
-        return self.length if self.length and arrived <= self.ended + AFTERMATH else 0
+        return self.length if self.length and arrived <= self.ended + AFTERMATH_NS else 0
 
     def fresh(self) -> bool:
         """Return True if a stall ended so recently that arrivals during it may not have been handled."""
         self.check()
-        return bool(self.length) and self._now() - self.ended <= AFTERMATH
+        return bool(self.length) and self._now() - self.ended <= AFTERMATH_NS
 
     def _sample_clock(self) -> None:
         self.check()
-        self._timer = asyncio.get_running_loop().call_later(STALL_PERIOD, self._sample_clock)
+        self._timer = asyncio.get_running_loop().call_later(STALL_PERIOD_S, self._sample_clock)

@@ -13,7 +13,7 @@ from zscout.mesh.supervision import Supervisor
 from zscout.messages import LAST_TERMS, MAX_COUNTER, ClientRequests, RcAsk, RcmState, RcState, StateAsk, of_the_last
 from zscout.types import NO_TERM, Term
 
-MOST_OF_RCS: Final = (LAST_TERMS + MAX_COUNTER) // 2
+MAX_RC_COUNTER: Final = (LAST_TERMS + MAX_COUNTER) // 2
 """With certificates: a higher term that RCs report is ignored, so that two lying hosts can't use up all terms."""
 
 
@@ -66,7 +66,7 @@ async def promised_elsewhere(mesh: Mesh, *, timeout: float) -> Term:
 
 
 def _confirmed(replies: list[Reply[RcState]], tokens: list[Token]) -> list[Reply[RcState]]:
-    """Replies of live RCs whose term is at most MOST_OF_RCS and no higher than the term of an RC on another host."""
+    """Replies of live RCs whose term is at most MAX_RC_COUNTER and no higher than the term of an RC on another host."""
     hosts = {(token.name, token.instance): token.host for token in tokens if token.role == Role.RC}
     live = [
         (reply, reply.message.term, host)
@@ -76,7 +76,7 @@ def _confirmed(replies: list[Reply[RcState]], tokens: list[Token]) -> list[Reply
     return [
         reply
         for reply, term, host in live
-        if term.counter <= MOST_OF_RCS and any(other != host and another >= term for _, another, other in live)
+        if term.counter <= MAX_RC_COUNTER and any(other != host and another >= term for _, another, other in live)
     ]
 
 

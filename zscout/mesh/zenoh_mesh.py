@@ -34,7 +34,7 @@ from zscout.logs import shortage
 from zscout.mesh import interfaces
 from zscout.mesh.exchange import SPAWN, MeshError
 from zscout.mesh.neighbours import Meeting
-from zscout.mesh.relinking import MEETING, Relinking
+from zscout.mesh.relinking import TEMPORARY_ID, Relinking
 from zscout.mesh.renewal import RenewableTransport
 from zscout.mesh.session import Mesh
 from zscout.mesh.supervision import clock
@@ -63,7 +63,7 @@ QUALITIES: dict[Quality, dict[str, Any]] = {
 QUERY: Any = {"target": zenoh.QueryTarget.ALL, "consolidation": zenoh.ConsolidationMode.NONE, **CONTROL}
 MAX_QUERIERS = 256  # per session: Zenoh never frees a key's declaration
 MAX_MESSAGE = 17_000_000  # bytes: a little more than zscout's largest message
-LOOK_AT_FILES = 2.0  # seconds between two checks for renewed certificates and changed rights
+FILE_CHECK_PERIOD = 2.0  # seconds between two checks for renewed certificates and changed rights
 ANY, ANY_TLS = "tcp/[::]:0", "tls/0.0.0.0:0"
 T = TypeVar("T")
 _PORT = re.compile(r":\d+$")
@@ -238,7 +238,7 @@ class ZenohMesh(Mesh):
         logged: str | None = None
         warned = ""
         while True:
-            await asyncio.sleep(LOOK_AT_FILES)
+            await asyncio.sleep(FILE_CHECK_PERIOD)
             if rights is not None and (access := await asyncio.wrap_future(in_thread("reads rights", rights.changed))):
                 if not access.ranks_of(self.me.host):
                     log.warning("%s has no role in the fleet file any more: its requests stay unanswered", self.me.host)
@@ -397,10 +397,10 @@ class ZenohTransport(Transport):
 
     def peers(self) -> list[str]:
         linked = (*self._session.info.peers_zid(), *self._session.info.routers_zid())
-        return [zid for zid in map(str, linked) if not zid.startswith(MEETING)]
+        return [zid for zid in map(str, linked) if not zid.startswith(TEMPORARY_ID)]
 
     def links(self) -> int:
-        return sum(not str(link.zid).startswith(MEETING) for link in self._session.info.links())
+        return sum(not str(link.zid).startswith(TEMPORARY_ID) for link in self._session.info.links())
 
     def relays(self) -> int:
         return len(list(self._session.info.routers_zid()))

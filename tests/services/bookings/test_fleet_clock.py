@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from zscout.services.bookings.fleet_clock import DIFFERS, LASTS, REMEMBERED, FleetClock, agreed
+from zscout.services.bookings.fleet_clock import DIFFERENCE_LASTS, DIFFERS, REMEMBERED, FleetClock, agreed
 from zscout.types import SECOND
 
 NOON = 1_800_000_000 * SECOND
@@ -74,7 +74,7 @@ def test_clocks_that_were_right_all_along_are_waited_for_a_minute() -> None:
     story = Story()
     story.read(x=0)
     told = [story.read(x=0, y=DAYS, z=DAYS + SECOND) for _ in range(3)]
-    assert (told, LASTS) == ([0, 0, DAYS], 2 * ROUND)
+    assert (told, DIFFERENCE_LASTS) == ([0, 0, DAYS], 2 * ROUND)
 
 
 def test_a_clock_that_is_set_away_from_what_others_say_hurries_nothing() -> None:

@@ -7,7 +7,7 @@ from decimal import Decimal
 from typing import Any
 
 from zscout.messages import Grants, Holder, PastHold, Revocation, Who
-from zscout.services.journal.follower import PublicationHeard
+from zscout.services.journal.follower import PublicationReceived
 from zscout.types import Grant, Place, Term
 
 TERM = Term(1, "rcm")
@@ -46,8 +46,8 @@ def published(
     return Grants(term, seq, seq - 1 if prev is None else prev, 0.5, rcs, [*revoked], begun=[*(begun or {}).items()])
 
 
-def heard(at: float, grants: Grants, silence: float = 0.5) -> PublicationHeard:
-    return PublicationHeard(at, silence, grants)
+def heard(at: float, grants: Grants, silence: float = 0.5) -> PublicationReceived:
+    return PublicationReceived(at, silence, grants)
 
 
 def past(seq: int, began: float, ended: float | None = None, outcome: str = "", **more: Any) -> PastHold:

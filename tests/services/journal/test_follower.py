@@ -11,22 +11,22 @@ from zscout.services.journal.follower import (
     MAX_EARLY,
     Change,
     ClockSet,
-    EndUnheard,
+    EndMissed,
     Follower,
     GapSeen,
-    Heard,
     HoldOver,
     HoldSeen,
     HoldUsed,
+    Observation,
     StateRead,
-    UseHeard,
+    UseReported,
 )
 from zscout.types import Grant, Place, Term
 
 SILENT = 2.0
 
 
-def told(follower: Follower, *events: Heard) -> list[Change]:
+def told(follower: Follower, *events: Observation) -> list[Change]:
     return [change for event in events for change in follower.take(event)]
 
 
@@ -94,7 +94,7 @@ def test_numbers_that_are_missing_are_a_gap_and_the_state_is_read() -> None:
     assert told(follower, StateRead(105.1, state(4))) == []
     assert reads(follower)
     ended, seen = told(follower, StateRead(106.0, state(6, grant(5), grant(6))))
-    assert ended == EndUnheard(grant(1), 104.6)
+    assert ended == EndMissed(grant(1), 104.6)
     assert isinstance(seen, HoldSeen)
     assert (seen.hold.grant, seen.hold.began, seen.hold.waited) == (grant(6), 99.0, None)
     assert not reads(follower)
@@ -130,7 +130,7 @@ def test_a_restart_is_a_gap_and_what_stood_then_may_be_over() -> None:
     follower = Follower(SILENT, [grant(1), grant(2)], heard=90.0)
     changes = told(follower, heard(100.0, published(8)))
     assert gaps(changes) == [JournalGap(90.0, 100.0, "off")]
-    assert told(follower, StateRead(100.5, state(8, grant(2)))) == [EndUnheard(grant(1), 90.0)]
+    assert told(follower, StateRead(100.5, state(8, grant(2)))) == [EndMissed(grant(1), 90.0)]
     assert gaps(told(follower, heard(100.6, published(9)))) == []
 
 
@@ -165,16 +165,16 @@ def test_hostile_publications_are_cut_or_ignored() -> None:
 def test_use_of_a_hold_that_is_followed_and_of_one_that_is_over() -> None:
     follower = Follower(SILENT)
     told(follower, heard(100.0, published(1, [holder(1, "robot/a")])))
-    assert told(follower, UseHeard([("robot/a", grant(1), 2.5)])) == [HoldUsed(grant(1), "robot/a", 2.5)]
+    assert told(follower, UseReported([("robot/a", grant(1), 2.5)])) == [HoldUsed(grant(1), "robot/a", 2.5)]
     told(follower, heard(107.0, published(2, revoked=[over(1, "released", "robot/a")])))
-    assert told(follower, UseHeard([("robot/a", grant(1), 4.0)])) == [HoldUsed(grant(1), "robot/a", 4.0)]
+    assert told(follower, UseReported([("robot/a", grant(1), 4.0)])) == [HoldUsed(grant(1), "robot/a", 4.0)]
 
 
 def test_use_that_is_heard_before_its_hold_is_told_again_behind_it() -> None:
     follower = Follower(SILENT)
     told(follower, heard(100.0, published(1)), StateRead(100.1, state(1)))
     words = [("robot/a", grant(number), float(number)) for number in (2, 3, 4)]
-    told(follower, UseHeard([*words, ("robot/b", grant(2), 9.0)]))
+    told(follower, UseReported([*words, ("robot/b", grant(2), 9.0)]))
     _, used = told(follower, heard(101.0, published(2, [holder(2, "robot/a")])))
     assert used == HoldUsed(grant(2), "robot/a", 2.0)
     over_too = over(3, "released", "robot/a")
@@ -190,9 +190,9 @@ def test_use_that_is_heard_before_its_hold_is_told_again_behind_it() -> None:
 def test_absurd_words_on_use_are_nothing_and_early_ones_are_bounded() -> None:
     follower = Follower(SILENT)
     for seconds in (-1.0, float("nan"), float("inf"), 1e12):
-        assert told(follower, UseHeard([("robot/a", grant(1), seconds)])) == []
-    assert told(follower, UseHeard([("robot/a", grant(2**64), 1.0)])) == []
-    told(follower, UseHeard([("robot/a", grant(number), 1.0) for number in range(MAX_EARLY + 1)]))
+        assert told(follower, UseReported([("robot/a", grant(1), seconds)])) == []
+    assert told(follower, UseReported([("robot/a", grant(2**64), 1.0)])) == []
+    told(follower, UseReported([("robot/a", grant(number), 1.0) for number in range(MAX_EARLY + 1)]))
     assert len(told(follower, heard(100.0, published(1, [holder(0, "robot/a")])))) == 1
     assert len(told(follower, heard(100.1, published(2, [holder(1, "robot/a")])))) == 2
 
@@ -201,4 +201,4 @@ def test_what_is_in_doubt_moves_with_the_clock() -> None:
     follower = Follower(SILENT)
     told(follower, heard(100.0, published(1, [holder(1, "robot/a")])), heard(105.0, published(3), silence=5.0))
     assert told(follower, ClockSet(259_200.0)) == [ClockSet(259_200.0)]
-    assert told(follower, StateRead(259_306.0, state(3))) == [EndUnheard(grant(1), 259_300.0)]
+    assert told(follower, StateRead(259_306.0, state(3))) == [EndMissed(grant(1), 259_300.0)]

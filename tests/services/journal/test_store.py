@@ -11,7 +11,7 @@ import pytest
 
 from tests.services.journal.kit import grant, past
 from zscout.messages import UNHEARD, HistoryAsk, JournalGap, ReasonParty, Who
-from zscout.services.journal.follower import Change, ClockSet, EndUnheard, GapSeen, HoldOver, HoldSeen, HoldUsed
+from zscout.services.journal.follower import Change, ClockSet, EndMissed, GapSeen, HoldOver, HoldSeen, HoldUsed
 from zscout.services.journal.store import ASIDE, FILE, MAX_KEPT_GAPS, JournalStore, Unwritable
 
 BEFORE_USE = """
@@ -88,15 +88,15 @@ def test_what_stood_is_told_when_it_is_opened(tmp_path: Path) -> None:
 
 def test_news_correct_what_was_taken_for_over(tmp_path: Path) -> None:
     store, (hold,) = opened(tmp_path), [past(1, NOW - 30)]
-    commit(store, HoldSeen(hold), EndUnheard(grant(1), NOW - 10), EndUnheard(grant(7), NOW))
+    commit(store, HoldSeen(hold), EndMissed(grant(1), NOW - 10), EndMissed(grant(7), NOW))
     (kept,) = store.answer("anvil", HistoryAsk(), NOW).holds
     assert (kept.ended, kept.outcome) == (NOW - 10, UNHEARD)
     # It was named again: it stands.
     commit(store, HoldSeen(past(1, NOW - 5, late=True)))
     assert store.answer("anvil", HistoryAsk(), NOW).holds == [hold]
-    commit(store, EndUnheard(grant(1), NOW - 4), HoldOver(past(1, NOW, NOW - 3, "completed")))
+    commit(store, EndMissed(grant(1), NOW - 4), HoldOver(past(1, NOW, NOW - 3, "completed")))
     # What ended by name does so once.
-    commit(store, HoldOver(past(1, NOW, NOW, "lost")), EndUnheard(grant(1), NOW), HoldSeen(hold))
+    commit(store, HoldOver(past(1, NOW, NOW, "lost")), EndMissed(grant(1), NOW), HoldSeen(hold))
     (kept,) = store.answer("anvil", HistoryAsk(), NOW).holds
     assert (kept.began, kept.ended, kept.outcome) == (NOW - 30, NOW - 3, "completed")
 
@@ -269,7 +269,7 @@ def test_a_clock_that_is_set_moves_the_beginnings_of_holds_that_stand(tmp_path: 
     store = opened(tmp_path)  # that hold began by another clock
     over = HoldOver(past(2, NOW - 20, NOW - 20, "completed", late=True))
     commit(store, HoldSeen(past(2, NOW - 300)), over, HoldSeen(past(3, NOW - 200)), HoldSeen(past(4, NOW - 100)))
-    commit(store, EndUnheard(grant(4), NOW - 10), ClockSet(by))
+    commit(store, EndMissed(grant(4), NOW - 10), ClockSet(by))
     commit(store, HoldOver(past(3, NOW + by, NOW + by, "completed", late=True)), now=NOW + by)
     found = {hold.grant.seq: hold for hold in store.answer("anvil", HistoryAsk(), NOW + 31 * DAY).holds}
     assert {seq: hold.began - NOW for seq, hold in found.items()} == {1: -400, 2: -300, 3: by - 200, 4: by - 100}

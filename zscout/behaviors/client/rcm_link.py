@@ -17,7 +17,7 @@ from zscout.config.fleet import Fleet
 from zscout.keyexpr import RANDOM, USERS, Role, Token
 from zscout.mesh import Declaration, IncomingQuery, Mesh, Refused, Reply
 from zscout.mesh.exchange import naming_versions
-from zscout.mesh.renewal import UNHEARD
+from zscout.mesh.renewal import SILENT_RCM_PATIENCE
 from zscout.mesh.supervision import StallWatch, Supervisor, done_within
 from zscout.mesh.terms import LastTerms
 from zscout.messages import (
@@ -211,7 +211,7 @@ class RcmLink:
                 self._last_contact = now - lease // CHECKS_PER_LEASE
             seen = self.leader is not None and not self.stalled
             silent = now - self._last_contact >= lease // 2
-            suspect("an RCM is seen that does not publish", so=seen and silent, patience=UNHEARD)
+            suspect("an RCM is seen that does not publish", so=seen and silent, patience=SILENT_RCM_PATIENCE)
             if now - self._last_contact < lease or self.stalled:
                 continue
             for arc in self.store.open:

@@ -12,7 +12,7 @@ from typing import Final, NamedTuple
 from zscout.types import SECOND, HostName, Ns
 
 DIFFERS: Final = 2.0  # seconds of a host clock's error before a warning, and before a correction
-LASTS: Final[Ns] = 60 * SECOND  # time for which most clocks differ before a correction
+DIFFERENCE_LASTS: Final[Ns] = 60 * SECOND  # time for which most clocks differ before a correction
 REMEMBERED: Final[Ns] = 3_600 * SECOND  # the clock of a silent host counts for so long
 MAX_HOSTS: Final = 1_000  # hosts whose clocks count: those read last
 SAME: Final = 1.0  # seconds: fleet times that began this close together are equally old
@@ -86,7 +86,7 @@ class FleetClock:
             host in before and _differ(offset, before[host].offset) and not _differ(offset, aim)
             for host, offset in offsets.items()
         )
-        if not was_set and now - self._doubted[1] < LASTS:
+        if not was_set and now - self._doubted[1] < DIFFERENCE_LASTS:
             return 0
         moved = aim - self._offset
         self.step(now + aim, now)

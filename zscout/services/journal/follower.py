@@ -23,7 +23,7 @@ MAX_NUMBER: Final = 10**9  # limit of a priority or a duration
 MAX_SEQ: Final = 2**63 - 1
 
 
-class PublicationHeard(NamedTuple):
+class PublicationReceived(NamedTuple):
     """A publication, `silence` seconds after the previous one or heartbeat."""
 
     at: float  # seconds since 1970, UTC
@@ -36,7 +36,7 @@ class StateRead(NamedTuple):
     state: messages.RcmState
 
 
-class UseHeard(NamedTuple):
+class UseReported(NamedTuple):
     """Use reported by RCs: (RC, grant, seconds), with the RC of the report's key."""
 
     reports: Sequence[tuple[RcName, Grant, float]]
@@ -58,7 +58,7 @@ class HoldOver(NamedTuple):
     hold: messages.PastHold
 
 
-class EndUnheard(NamedTuple):
+class EndMissed(NamedTuple):
     """A hold ended at `at` or later."""
 
     grant: Grant
@@ -77,8 +77,8 @@ class HoldUsed(NamedTuple):
     seconds: float
 
 
-Heard: TypeAlias = PublicationHeard | StateRead | UseHeard | ClockSet
-Change: TypeAlias = HoldSeen | HoldOver | EndUnheard | HoldUsed | GapSeen | ClockSet
+Observation: TypeAlias = PublicationReceived | StateRead | UseReported | ClockSet
+Change: TypeAlias = HoldSeen | HoldOver | EndMissed | HoldUsed | GapSeen | ClockSet
 
 
 class Follower:
@@ -95,14 +95,14 @@ class Follower:
         """Use under grants that are not followed, ended or not known yet; at most MAX_EARLY, the latest."""
         self.must_read = False  # true while the RCM's state must be read, and passed as a `StateRead`
 
-    def take(self, event: Heard) -> Iterator[Change]:
+    def take(self, event: Observation) -> Iterator[Change]:
         """Yield the resulting changes; none for an earlier term."""
         match event:
-            case PublicationHeard():
+            case PublicationReceived():
                 return self._heard(event)
             case StateRead():
                 return self._read(event)
-            case UseHeard():
+            case UseReported():
                 return self._used(event)
             case ClockSet():
                 return self._set_clock(event)
@@ -112,7 +112,7 @@ class Follower:
             self._doubt += event.by
         yield event
 
-    def _heard(self, event: PublicationHeard) -> Iterator[Change]:
+    def _heard(self, event: PublicationReceived) -> Iterator[Change]:
         at, grants = event.at, event.grants
         if grants.term < self._term or not _is_sane(Grant(grants.term, grants.seq)):
             return
@@ -135,7 +135,7 @@ class Follower:
                 yield HoldOver(hold := _over(revoked, at))
                 yield from self._used_early(hold)
 
-    def _gap_before(self, event: PublicationHeard) -> messages.JournalGap | None:
+    def _gap_before(self, event: PublicationReceived) -> messages.JournalGap | None:
         at, grants = event.at, event.grants
         if self._left is not None:
             return messages.JournalGap(min(self._left, at), at, "off")
@@ -158,7 +158,7 @@ class Follower:
         current = {hold.grant for hold in state.holds}
         for grant in [grant for grant in self._open if grant not in current]:
             del self._open[grant]
-            yield EndUnheard(grant, at if since is None else since)
+            yield EndMissed(grant, at if since is None else since)
         for hold in state.holds:
             if hold.grant not in self._open and _is_sane(hold.grant):
                 yield from self._in_force(_viewed(hold, at))
@@ -174,7 +174,7 @@ class Follower:
         yield HoldSeen(hold)
         yield from self._used_early(hold)
 
-    def _used(self, event: UseHeard) -> Iterator[Change]:
+    def _used(self, event: UseReported) -> Iterator[Change]:
         for rc, grant, seconds in event.reports:
             if _is_sane(grant) and 0 <= seconds <= MAX_NUMBER:
                 yield HoldUsed(grant, rc, seconds)

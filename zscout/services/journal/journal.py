@@ -19,7 +19,15 @@ from zscout.keyexpr import check_need
 from zscout.mesh import Declaration, IncomingQuery, Mesh, MeshError
 from zscout.mesh.supervision import Supervisor, done_within
 from zscout.messages import Grants, HistoryAsk, JournalGap, PastHold, Problem, RcmState, RcState, StateAsk
-from zscout.services.journal.follower import Change, ClockSet, Follower, Heard, PublicationHeard, StateRead, UseHeard
+from zscout.services.journal.follower import (
+    Change,
+    ClockSet,
+    Follower,
+    Observation,
+    PublicationReceived,
+    StateRead,
+    UseReported,
+)
 from zscout.services.journal.store import Damaged, JournalStore, Unwritable
 from zscout.types import NO_TERM, SECOND, Grant, Ns, RcName, Term
 
@@ -31,7 +39,7 @@ READ_EVERY: Final = 2.0  # seconds between two queries for the RCM's state, whil
 AGAIN_AFTER: Final = 30.0  # seconds until a failed disk is retried
 MAX_GATHERED: Final = 100_000  # holders and ends awaiting a commit; further ones are dropped, and make a gap
 MAX_USES: Final = 10_000  # reports of use awaiting a commit, or remembered against duplicates
-MAX_TOLD: Final = 5_000  # holds passed to `on_opened`
+MAX_LATEST: Final = 5_000  # holds passed to `on_opened`
 MAX_ASKING: Final = 16  # queries answered at one time
 ENDS_WITHIN: Final = 5.0
 STEADY: Final[Ns] = 600 * SECOND  # after the wall clock was set, until which no hold is removed for its age
@@ -58,13 +66,11 @@ class Journal:
         self._supervisor = Supervisor(
             "the journal", lambda _: log.error("no journal is written until this node restarts")
         )
-        self._gathered: list[Heard] = []
+        self._gathered: list[Observation] = []
         self._weight = 0  # of the gathered events
         self._uses: dict[tuple[RcName, Grant], float] = {}  # most seconds of use since the last commit
-        self._reported: OrderedDict[RcName, dict[Grant, tuple[float, bool]]] = (
-            OrderedDict()
-        )  # last reports; True if the hold ended
-        """By RC and grant: the last report, True if the hold ended."""
+        self._reported: OrderedDict[RcName, dict[Grant, tuple[float, bool]]] = OrderedDict()
+        """By RC and grant: seconds of the last report, and True if the hold ended."""
         self._reported_count = 0
         self._number: tuple[Term, int] = NO_TERM, 0
         self._at: Ns | None = None  # last publication, by the mesh's clock
@@ -120,10 +126,10 @@ class Journal:
         self._ahead = ahead
         self._at, self._heard, self._first = now, at, self._first or at
         if grants.rcs or grants.revoked or number != self._number or silence > self._silent:
-            self._gather(PublicationHeard(at, silence, grants), at)
+            self._gather(PublicationReceived(at, silence, grants), at)
         self._number = number
 
-    def _gather(self, event: Heard, at: float) -> None:
+    def _gather(self, event: Observation, at: float) -> None:
         if self._weight + len(self._pending) + (weight := _weight(event)) > MAX_GATHERED:
             self._dropped_since = self._dropped_since if self._dropped else at
             self._dropped += 1
@@ -170,7 +176,7 @@ class Journal:
         try:
             if self._follower is None:
                 open_holds, left = await asyncio.to_thread(self._store.open)
-                latest = [] if self._opened else await asyncio.to_thread(self._store.latest, MAX_TOLD)
+                latest = [] if self._opened else await asyncio.to_thread(self._store.latest, MAX_LATEST)
                 self._follower = Follower(self._silent, open_holds, left)
                 if not self._opened:
                     self._opened = True
@@ -188,7 +194,7 @@ class Journal:
         events, self._gathered, self._weight, heard = self._gathered, [], 0, self._heard
         if self._uses and heard:
             # After the starts and ends received before.
-            events.append(UseHeard([(*key, seconds) for key, seconds in self._uses.items()]))
+            events.append(UseReported([(*key, seconds) for key, seconds in self._uses.items()]))
             self._uses, self._used_last = {}, False
         dropped, self._dropped = self._dropped, 0
         steady = self._mesh.now() - self._set_at > STEADY
@@ -248,12 +254,12 @@ class Journal:
         query.answer(answer)
 
 
-def _weight(event: Heard) -> int:
+def _weight(event: Observation) -> int:
     """Rough size of an event's records."""
     match event:
         case StateRead():
             return 1 + len(event.state.holds)
-        case PublicationHeard():
+        case PublicationReceived():
             return 1 + sum(map(len, event.grants.rcs.values())) + len(event.grants.revoked)
         case _:
             return 1

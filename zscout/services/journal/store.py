@@ -1,6 +1,6 @@
 """A candidate's journal on disk: one SQLite file, bounded in size and age.
 
-Calls block, and come from threads. WAL mode with a sync per commit: commits survive the process and the host."""
+Calls block, and come from threads. WAL mode with a sync per commit: commits survive crashes of process and host."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ import msgspec
 
 from zscout import messages
 from zscout.keyexpr import check_need, is_pattern, matcher
-from zscout.services.journal.follower import Change, ClockSet, EndUnheard, GapSeen, HoldOver, HoldSeen, HoldUsed
+from zscout.services.journal.follower import Change, ClockSet, EndMissed, GapSeen, HoldOver, HoldSeen, HoldUsed
 from zscout.types import Grant, RcName, Term
 
 log = logging.getLogger(__name__)
@@ -287,7 +287,7 @@ def _apply(db: sqlite3.Connection, change: Change, before: int) -> None:
             db.execute(_BEGAN, _row(hold))
         case HoldOver(hold):
             db.execute(_ENDED, _row(hold))
-        case EndUnheard(Grant(term, seq), at):
+        case EndMissed(Grant(term, seq), at):
             db.execute(_UNHEARD, (at, term.counter, term.rcm, seq))
         case HoldUsed(grant, rc, seconds):
             _use(db, grant, rc, seconds)

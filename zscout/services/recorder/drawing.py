@@ -33,7 +33,7 @@ MAX_SLOTS: Final = 8
 """Rows of one lane; further bars are counted in its last row."""
 MAX_STATE: Final = 120
 MAX_EVENT: Final = 500
-"""Characters."""
+"""Characters of a bar's text, and of an event."""
 COMPONENT: Final = "component "
 """Prefix of the command of a request made by a component, not by a person."""
 # Latin, Greek and Cyrillic letters, dashes, quotation marks, arrows. The viewer's font lacks other characters, and
