@@ -86,6 +86,20 @@ def test_who_is_asked_sees_whom_it_takes_from_when_the_json_goes_elsewhere(fleet
     assert survey.wait(HANG) == 1
 
 
+@pytest.mark.slow
+def test_timeout_0_tries_once(fleet: CliFleet) -> None:
+    """It takes what others yield, and waits for no equal."""
+    low = fleet.holder("low", "robot/a")
+    taken = fleet.zscout("take", "robot/a", "--yes", "--timeout", "0", "--", "sh", "-c", "exit 6")
+    assert taken.returncode == 6, taken.stderr
+    assert low.wait(HANG) == 1
+    peer = fleet.holder("peer", "robot/b", "--priority", "10")
+    once = fleet.zscout("take", "robot/b", "--yes", "--timeout", "0")
+    assert once.returncode == 1
+    assert f"operator was not granted at once, and is cancelled: waits for {own('peer')}: robot/b" in once.stderr
+    end(peer)
+
+
 def test_what_is_free_is_taken_without_a_question(fleet: CliFleet) -> None:
     done = fleet.zscout("take", "robot/a", "--", "sh", "-c", "exit 6")
     assert done.returncode == 6, done.stderr

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from tests.cli.cli_fleet import CliFleet, fleet_of
-from tests.cli.tools import end, events, out_of
+from tests.cli.tools import CLOCK, end, events, out_of, own
 from tests.cli.tools import zscout as in_a_pipe
 from tests.hang import HANG
 from zscout.cli.main import main
@@ -174,7 +174,10 @@ def test_timeout_0_tries_once(fleet: CliFleet) -> None:
     blocker = fleet.holder("blocker", "robot/a", "--min-runtime", "10m")
     done = fleet.zscout("request", "robot/a", "--name", "next", "--timeout", "0", "--", "true")
     assert done.returncode == 1
-    assert re.search(r"^zscout: next was not granted at once, and is cancelled: .*blocker", done.stderr, re.MULTILINE)
+    reason = rf"waits for {own('blocker')}: robot/a, until {CLOCK} at the latest"
+    assert re.fullmatch(
+        f"zscout: next was not granted at once, and is cancelled: {reason}", done.stderr.splitlines()[-1]
+    )
     fleet.state(lambda state: not state.queue)
     end(blocker)
 

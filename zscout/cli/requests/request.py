@@ -177,13 +177,13 @@ async def wait_for_grant(client: Client, wanted: HoldOptions, report: Report, ar
             async with common.beside(_give_up_once_queued(client, arc, limit)) if once else nullcontext():
                 grant = await client.granted(arc, confirmed=True)
     except (TimeoutError, asyncio.CancelledError) as error:
-        why = arc.reason if arc is not None else ""
+        reason, why = ("", "") if arc is None else (arc.reason, _reason_words(arc, client))
         if arc is not None:
             await client.end(arc)
         if isinstance(error, asyncio.CancelledError):
             report.event("ended", f"{wanted.name} is cancelled", outcome="cancelled")
             raise
-        report.event("ended", "", outcome="timeout", reason=why)
+        report.event("ended", "", outcome="timeout", reason=reason)
         if once and arc is None:
             raise common.NobodyThere(f"the leader of fleet {client.fleet.name} did not answer; try again") from None
         within = "at once" if once else f"within {span(wanted.timeout or 0)}"
@@ -557,7 +557,7 @@ class Report(LiveLine):
         in_way = [rc for rc in met.values() if not rc.sharable or (arc.why and rc.rc in arc.why.rcs)]
         holders = [f"{rc.rc}: {'; '.join(hold_text(hold, arc.priority, me) for hold in rc.holds)}" for rc in in_way]
         holders += [f"{rc.rc}: {rc.lost}" for need in needs if need.rc for rc in need.rcs if rc.lost]
-        words = f"{arc.name} {waits(reason_text(arc.reason, arc.why, (now - arc._notified_at) / SECOND, me), arc.why)}"
+        words = f"{arc.name} {waits(_reason_words(arc, self._client), arc.why)}"
         ahead = f"{arc.ahead} ahead" if arc.ahead else ""
         waited = self._since(arc)
         since = ", ".join(filter(None, (f"waits since {clock(-waited)} ({span(waited)})", ahead, start)))
@@ -590,6 +590,11 @@ class Report(LiveLine):
 
 def _how(arc: OpenArc) -> tuple[str, str, int | None]:
     return arc.state, arc.reason, arc.ahead
+
+
+def _reason_words(arc: OpenArc, client: Client) -> str:
+    """Why it waits, as the user of `client` reads it now."""
+    return reason_text(arc.reason, arc.why, (client.mesh.now() - arc._notified_at) / SECOND, User.of(client))
 
 
 def _undecided(arc: OpenArc) -> bool:
