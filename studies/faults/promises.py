@@ -290,7 +290,7 @@ class Promises:
         `silence`."""
         for name, client in clients.items():
             term, before = client.internals.term, self._believed.get(name, NO_TERM)
-            self._believed[name] = client.internals.rcm._heard
+            self._believed[name] = client.internals.rcm._received_term
             silent, self._silent[name] = self._silent.get(name, 0), silence[name]
             if term < before and silent / SECOND < self._hold_lease - JUST_NOW:
                 self._broken(f"{name} went back from {before} to {term}, though that leader published recently")

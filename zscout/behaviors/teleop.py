@@ -35,7 +35,7 @@ AT_LEAST: Final = 1.0
 """Minimum runtime of the hold, in seconds: another operator can't take over sooner."""
 
 ASKS_AGAIN: Final = frozenset({"preempted", "lost"})
-"""Outcomes of a hold after which the robot is requested again; after others, which are deliberate, it is not."""
+"""Outcomes of a hold after which the robot is requested again. Others are deliberate ends."""
 FIRST: Final = 0.6
 """Seconds of driving per press of a key."""
 NEXT: Final = 0.25

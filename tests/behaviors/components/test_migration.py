@@ -48,14 +48,14 @@ async def test_a_node_that_is_not_linked_yet_is_asked_again() -> None:
     move = OutgoingMove(client, Counter({}), SafePointGate(), MoveComponent("c", 1, "b", 2))
     began = client.mesh.now()
     with pytest.raises(NotMoved, match="b did not answer"):
-        await move._give(b"", [])
+        await move._send_state(b"", [])
     assert (client.mesh.now() - began) / SECOND == pytest.approx(RESTORE_TIMEOUT, abs=1.1)
 
     def serve() -> None:
         node.serve(node.keys.component("b", node.me), ComponentOperation, lambda query: query.answer(STANDS_BY))
 
     asyncio.get_running_loop().call_later(1, serve)
-    await move._give(b"", [])
+    await move._send_state(b"", [])
 
 
 async def test_where_the_rcm_refuses_the_hand_over_the_other_one_is_stopped() -> None:

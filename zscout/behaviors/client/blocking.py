@@ -95,17 +95,17 @@ class BlockingHeld:
         self._lab.run(self._call_when_noticed(callback))
 
     async def noticed(self) -> HoldNotice | None:
-        """Wait, in any event loop, for the next such notice. None: the hold is over."""
+        """Wait, in any event loop, for the next notice. None: the hold is over."""
         return await asyncio.wrap_future(self._lab.submit(self._held.noticed()))
 
     async def over(self) -> None:
         """Wait, in any event loop, until the hold is over."""
-        self._body.waits = True
+        self._body.awaits_end = True
         try:
             await asyncio.wrap_future(self._lab.submit(self._held.over()))
             self._body.notified = True
         finally:
-            self._body.waits = False
+            self._body.awaits_end = False
 
     def release(self) -> None:
         """Give the devices back. Does nothing once the hold is over."""
@@ -126,12 +126,12 @@ class BlockingHeld:
 
     def wait(self, timeout: float | None = None) -> bool:
         """Wait until the hold is over, at most `timeout` seconds; return True if it is. Does not raise Revoked."""
-        self._body.waits = True
+        self._body.awaits_end = True
         try:
             over = self._lab.run(self._over_within(timeout))
             self._body.notified |= over
         finally:
-            self._body.waits = False
+            self._body.awaits_end = False
         return over
 
     @property

@@ -112,7 +112,7 @@ class Confirmations:
 
     async def _see_confirmed(self, arc: OpenArc, confirmation: Confirmation) -> None:
         grant = confirmation.grant
-        if grant == arc._left:
+        if grant == arc._grant_left:
             # This client has announced to the RCs that its program is leaving, though a new RCM continues the hold.
             over = Problem("ended", "its program was asked to end")
             refusals = [CommandRefused(rc, over) for rc in arc.rcs]

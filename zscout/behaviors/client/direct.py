@@ -136,7 +136,7 @@ class DirectHold:
     def end(self, *, released: bool = False) -> None:
         """End the hold. `released`: its program has ended, and the client gives the hold back."""
         if not self.over:
-            self.ended_at, self.arc._left = self._now(), self.grant
+            self.ended_at, self.arc._grant_left = self._now(), self.grant
             self._stop_confirming()
             self._notify()
         if released:

@@ -210,8 +210,8 @@ class MovableClient:
             reply = await self.rcm.query(operation)
             notice, problem = (reply.message, reply.problem) if reply is not None else (None, None)
             awaited = await self._awaited_by(to) if notice is not None else set()
-            # A candidate that got a promise meanwhile has a report that the requests are here: `accept` drops answers
-            # of lower terms.
+            # If this client has promised a higher term meanwhile, that candidate counts the requests as this client's,
+            # so `accept` drops the answers of lower terms.
             if notice is not None and self.rcm.accept(notice.term):
                 # A leader elected since the start answers for the first request alone: it may not know the others.
                 answered = arcs if notice.term == term else [first]

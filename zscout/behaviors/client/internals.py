@@ -26,7 +26,7 @@ from zscout.types import SECOND, Grant, Ns, Term
 CLOSING_REPORT_TIMEOUT: Final = 0.5
 """Longest time in seconds for which a closing client still reports to RCs that its programs are gone."""
 REJOIN_TIMEOUT: Final = 0.5
-"""Seconds for which an unanswered command is repeated: within them, a new session is known to all."""
+"""Seconds for which a command without an answer is repeated: others learn of a new mesh session within that time."""
 REPEAT_AFTER: Final = 0.05
 """Seconds between two such repetitions."""
 NOTICE_TIMEOUT: Final = 1.0
@@ -167,12 +167,12 @@ class ClientInternals(MovableClient):
         """End an ARC whose time is over by this host's clock, though a direct body may still clean up."""
         if arc.grant is not None:
             self._expired.add(arc.id)
-            self.supervisor.call_later(NOTICE_TIMEOUT, self._give_up, arc.id)
+            self.supervisor.call_later(NOTICE_TIMEOUT, self._give_back_unreported, arc.id)
         arc._finish("completed", "its minimum runtime is over", self.mesh.now())
         self.store.notify(arc)
         self.store.forget(arc)
 
-    def _give_up(self, request_id: str) -> None:
+    def _give_back_unreported(self, request_id: str) -> None:
         """Give back a hold that is over by this host's clock, and not by a notice: the leader may have granted it
         again, and that notice was lost."""
         expired = request_id in self._expired
@@ -208,11 +208,11 @@ class ClientInternals(MovableClient):
             arc = next((arc for arc in self.store.open if arc.grant == grant), None)
             if refused.code in NOT_HELD and arc is not None and grant not in self._denied:
                 self._denied.add(grant)
-                self.supervisor.call_later(NOTICE_TIMEOUT, self._lose, arc, grant, str(refused))
+                self.supervisor.call_later(NOTICE_TIMEOUT, self._end_denied, arc, grant, str(refused))
             raise refused
         return reply.message
 
-    def _lose(self, arc: OpenArc, grant: Grant, reason: str) -> None:
+    def _end_denied(self, arc: OpenArc, grant: Grant, reason: str) -> None:
         """End a hold that one of its RCs does not have any more, though no notice has reported that."""
         self._denied.discard(grant)
         if arc.grant == grant and arc.id in self.store.arcs and self.store.resumed.is_set():

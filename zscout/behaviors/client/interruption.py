@@ -37,10 +37,10 @@ class InterruptibleBody:
         """True once it must be interrupted."""
         self.notified = False
         """True once the body has got the error, or learned of the end in another way."""
-        self.waits = False
+        self.awaits_end = False
         """True while the body itself waits for the end of its hold."""
         self._frame: FrameType | None = None
-        self._away = False
+        self._off_stack = False
         """True if its function was not on the stack at the last signal."""
 
     def enter(self) -> None:
@@ -66,12 +66,12 @@ class InterruptibleBody:
         while not self.notified:
             signal.pthread_kill(_main_thread(), SIGNAL)
             await asyncio.sleep(pause)
-            pause = min(2 * pause, LONGEST_REPEAT) if self._away else REPEAT_AFTER
+            pause = min(2 * pause, LONGEST_REPEAT) if self._off_stack else REPEAT_AFTER
 
     def is_on(self, frames: list[FrameType]) -> bool:
         """Return True if its function is on this stack."""
-        self._away = self._frame not in frames
-        return not self._away
+        self._off_stack = self._frame not in frames
+        return not self._off_stack
 
 
 def interruptible() -> bool:
@@ -81,13 +81,13 @@ def interruptible() -> bool:
 
 def uninterrupted(function: F) -> F:
     """Decorate a function in which nothing may be raised; a due error is raised after it."""
-    _quiet.add(function.__code__)
+    _uninterrupted.add(function.__code__)
     return function
 
 
 _bodies: Final[list[InterruptibleBody]] = []
 """Outermost first."""
-_quiet: Final[set[CodeType]] = set()
+_uninterrupted: Final[set[CodeType]] = set()
 _previous: Any = None
 """The previous handler."""
 
@@ -104,9 +104,9 @@ def _on_signal(number: int, frame: FrameType | None) -> None:
             _previous(number, frame)
         return
     frames = [*_outwards(frame)]
-    if any(outer.f_code in _quiet for outer in frames):
+    if any(outer.f_code in _uninterrupted for outer in frames):
         return
-    due = (body for body in _bodies if body.over and not body.notified and not body.waits)
+    due = (body for body in _bodies if body.over and not body.notified and not body.awaits_end)
     if (body := next((body for body in due if body.is_on(frames)), None)) is not None:
         body.notified = True
         raise body.make_error()

@@ -66,13 +66,13 @@ class RcmLink:
         self.key = mesh.keys.schedule(mesh.me)
         self.term: Term = NO_TERM
         """The highest term received or promised; messages of lower terms are ignored."""
-        self._heard: Term = NO_TERM
+        self._received_term: Term = NO_TERM
         """The highest term received from a leader, without promises to candidates."""
-        self._lower: tuple[Term, Ns] = NO_TERM, 0
-        """A lower term in which a leader publishes, and since when."""
+        self._lower_leader: tuple[Term, Ns] = NO_TERM, 0
+        """A lower term in which a leader publishes, and the time since when."""
         self._unanswered = False
         """True if the last query had no answer of a current RCM."""
-        self._is_ahead = False
+        self._rcm_is_behind = False
         """True if the last answer was of a lower term: the next query then informs its RCM of the higher one."""
         self.leader_came = asyncio.Event()
         self._leaders: set[Token] = set()
@@ -109,12 +109,12 @@ class RcmLink:
             return False
         self.term = term
         if not promise:
-            self._heard = term
+            self._received_term = term
         return True
 
     def _only_promised(self, term: Term) -> bool:
         """Return True if a leader of `term` is visible and the highest term is only a promise to a candidate."""
-        newer = self._heard < term and self._heard < self.term
+        newer = self._received_term < term and self._received_term < self.term
         return self.mesh.keys.closed and newer and any(token.instance == term.rcm for token in self._leaders)
 
     async def _follow_lower(self, terms: list[Term]) -> None:
@@ -123,12 +123,12 @@ class RcmLink:
         now, lease = self.mesh.now(), self.fleet.timing.hold_lease
         term = max(terms, default=NO_TERM)
         if not self.mesh.keys.closed or self._in_contact or term >= self.term:
-            self._lower = NO_TERM, now
+            self._lower_leader = NO_TERM, now
         elif term > NO_TERM:
-            if term != self._lower[0]:
-                self._lower = term, now
+            if term != self._lower_leader[0]:
+                self._lower_leader = term, now
             seen = any(token.instance == term.rcm for token in self._leaders)
-            if now - self._lower[1] >= lease and seen and await self._is_obeyed(term) and term < self.term:
+            if now - self._lower_leader[1] >= lease and seen and await self._is_obeyed(term) and term < self.term:
                 self._go_back(term)
 
     async def _is_obeyed(self, term: Term) -> bool:
@@ -139,8 +139,8 @@ class RcmLink:
 
     def _go_back(self, term: Term) -> None:
         log.warning("back from term %d to the leader of term %d", self.term.counter, term.counter)
-        self.term = self._heard = term
-        self._is_ahead = False
+        self.term = self._received_term = term
+        self._rcm_is_behind = False
         self.store.go_back(term)
         self._changes += 1
         self.leader_came.set()
@@ -275,16 +275,16 @@ class RcmLink:
         """Submit a request once, and apply the answer. Return the problem if it was refused."""
         ask = arc._ask(self.mesh.now(), reachable=reachable)
         # With `term`, an RCM that was replaced learns so; it would refuse a place of a later RCM as impossible.
-        ahead = self._is_ahead or arc._place is not None
-        reply = await self.query(msgspec.structs.replace(ask, term=self.term) if ahead else ask)
+        show_term = self._rcm_is_behind or arc._place is not None
+        reply = await self.query(msgspec.structs.replace(ask, term=self.term) if show_term else ask)
         # An answer of a replaced RCM doesn't count.
         self._unanswered = reply is None or (reply.message is not None and reply.message.term < self.term)
         if reply is None:
             return None
         if reply.message is not None:
-            self._is_ahead = reply.message.term < self.term
+            self._rcm_is_behind = reply.message.term < self.term
         elif reply.problem is not None:
-            self._is_ahead = reply.problem.code == "old_term"
+            self._rcm_is_behind = reply.problem.code == "old_term"
         if reply.message is not None and self.accept(reply.message.term):
             self.store.take(arc, reply.message)
         return reply.problem

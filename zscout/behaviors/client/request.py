@@ -101,7 +101,7 @@ class OpenArc:
     _place: Place | None = None
     _seal: str | None = None
     """The RCM's proof that the place belongs to this request."""
-    _was: str | None = None
+    _former_id: str | None = None
     """Former id, if `_place` was given under another id."""
     ahead: int | None = None
     """While it is queued: how many requests are before it."""
@@ -130,7 +130,7 @@ class OpenArc:
     """A grant and the RCs that did not confirm it, until the RCM has answered that report."""
     _settling: Grant | None = None
     """A grant of which some RCs are still settling."""
-    _left: Grant | None = None
+    _grant_left: Grant | None = None
     """The last grant whose program was asked to leave: no body enters it again."""
     _unserved: Grant | None = None
     """A grant whose time passed while RCs were settling, until the RCM has answered that report."""
@@ -183,16 +183,16 @@ class OpenArc:
         if notice.state != self.state or notice.grant != self.grant:
             self.since = now
         if notice.state != "running":
-            self._close(HoldEnd(notice.outcome or "lost", notice.reason, notice.by), now)
+            self._end_hold(HoldEnd(notice.outcome or "lost", notice.reason, notice.by), now)
         elif notice.grant != self.grant:
-            self._close(HoldEnd("lost", "the leader took this client for gone; it is granted again"), now)
+            self._end_hold(HoldEnd("lost", "the leader took this client for gone; it is granted again"), now)
         self.state = notice.state
         self.reason, self.why = notice.reason, notice.why
         self.outcome, self.by = notice.outcome, notice.by
         self.ahead = notice.ahead
         self.start = None if notice.starts_in is None else now + round(notice.starts_in * SECOND)
         if notice.place is not None and (self._place is None or notice.place <= self._place):
-            self._place, self._seal, self._was = notice.place, notice.seal, None
+            self._place, self._seal, self._former_id = notice.place, notice.seal, None
         if notice.state == "running":
             self.grant = notice.grant
             self.bound, self.rcs = bound, sorted(bound.get(need, need) for need in self.needs)
@@ -216,7 +216,7 @@ class OpenArc:
                 return bound
         return None
 
-    def _close(self, ending: HoldEnd, now: Ns) -> None:
+    def _end_hold(self, ending: HoldEnd, now: Ns) -> None:
         if self.grant is not None:
             self.grant, self._ending, self._waits_since, self.ready = None, ending, now, None
             self.upcoming = []
@@ -225,7 +225,7 @@ class OpenArc:
 
     def _lose(self, reason: str, now: Ns) -> None:
         """End the hold by the client's own judgement; the request must be submitted again."""
-        self._close(HoldEnd("lost", reason), now)
+        self._end_hold(HoldEnd("lost", reason), now)
         self.state, self.reason, self.outcome, self.since = "asking", reason, "lost", now
         self.why = None
 
@@ -243,11 +243,11 @@ class OpenArc:
 
     def _finish(self, outcome: str, reason: str, now: Ns) -> None:
         """End the request by the client's own judgement."""
-        self._close(HoldEnd(outcome, reason), now)
+        self._end_hold(HoldEnd(outcome, reason), now)
         self.state, self.outcome, self.reason, self.since = "ended", outcome, reason, now
         self.why = None
 
-    def _shows_place(self, notice: Notice) -> bool:
+    def _must_show_place(self, notice: Notice) -> bool:
         """Return True if the client must show its place to the RCM, which has assigned a worse one in answer to an
         older query; at most once per term."""
         if notice.state != "queued" or notice.place is None or notice.place == self._place:
@@ -290,7 +290,7 @@ class OpenArc:
         if self._last[0] > term:
             self._last = NO_TERM, 0
         if self._place is not None and self._place.term > term:
-            self._place = self._seal = self._was = None
+            self._place = self._seal = self._former_id = None
         if self._unconfirmed is not None and self._unconfirmed[0].term > term:
             self._unconfirmed = None
         if self._unserved is not None and self._unserved.term > term:
@@ -298,14 +298,14 @@ class OpenArc:
 
     def _move(self, now: Ns) -> None:
         """End the hold here; the request continues in another client."""
-        self._close(HoldEnd("handed_over", "handed over"), now)
+        self._end_hold(HoldEnd("handed_over", "handed over"), now)
         self.state, self.since = "moved", now
 
     def _take_back(self, new_id: str, reason: str, now: Ns) -> None:
         """Prepare a new request, with `new_id`, at the old place."""
         if self._ending is not None and self._ending.outcome == "handed_over":
             self._ending = HoldEnd("lost", reason)
-        self.id, self._was, self._last = new_id, self._was or self.id, (NO_TERM, 0)
+        self.id, self._former_id, self._last = new_id, self._former_id or self.id, (NO_TERM, 0)
         self.state, self.reason, self.outcome, self.since = "asking", reason, None, now
         self.why = None
 
@@ -338,7 +338,7 @@ class OpenArc:
             keep=self.keep,
             place=self._place,
             seal=self._seal,
-            was=self._was,
+            was=self._former_id,
             waited=max(0, now - since) / SECOND,
             grant=grant,
             rcs=self.rcs if grant is not None else [],
@@ -367,8 +367,8 @@ def check_seconds(what: str, value: Any) -> None:
 
 
 class RequestStore:
-    """A client's requests that are not over, by id; notifies waiters of their changes; and knows if the client is
-    paused."""
+    """A client's requests that are not over, by id. Notifies waiters of their changes, and holds the client's paused
+    state."""
 
     def __init__(self, now: Callable[[], Ns], ask_again: Callable[[OpenArc], object]) -> None:
         """`ask_again` is called with each request that must be submitted again: the RCM dropped it because this client
@@ -465,7 +465,7 @@ class RequestStore:
                 self._ask_again(arc)
             elif not granted and arc.outcome == "completed":
                 self._submit_under_new_id(arc)
-            elif arc._shows_place(notice):
+            elif arc._must_show_place(notice):
                 self._ask_again(arc)
             self.notify(arc)
             if not arc.open:

@@ -15,7 +15,7 @@ from zscout.config.fleet import Fleet
 from zscout.messages import MAX_MOVE, HowEnded, Problem, StartComponent
 
 MAX_FRAME: Final = MAX_MOVE + 65_536
-"""Bytes."""
+"""Most bytes of a frame: a move and its envelope."""
 PATIENCE: Final = 5.0
 """Seconds that a component has to reach a safe point for a checkpoint."""
 

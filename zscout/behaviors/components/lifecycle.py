@@ -64,7 +64,7 @@ class ComponentLifecycle:
         self._client: Client | None = None
         self._component: Component | None = None
         self._gate = SafePointGate()
-        self._holding = asyncio.Lock()
+        self._gate_lock = asyncio.Lock()
         self._move: OutgoingMove | None = None
         self._running = False
         self._instance = f"{job.start.incarnation}-{new_instance()}"
@@ -238,7 +238,7 @@ class ComponentLifecycle:
 
     async def _take_checkpoint(self, number: int) -> None:
         component, _ = self._movable()
-        async with self._holding:
+        async with self._gate_lock:
             if not await self._gate.hold(channel.PATIENCE):
                 raise NotMoved("not_safe", f"it reached no safe point within {channel.PATIENCE:g} s")
             try:
@@ -249,7 +249,7 @@ class ComponentLifecycle:
 
     async def _move_away(self, number: int, move: MoveComponent) -> None:
         component, client = self._movable()
-        async with self._holding:
+        async with self._gate_lock:
             self._move = OutgoingMove(client, component, self._gate, move)
             try:
                 dead = await self._move.carry_out()

@@ -85,7 +85,7 @@ class OutgoingMove:
 
     async def _hand_over(self) -> None:
         state, requests = state_of(self._component), self._client.internals.open_requests()
-        await self._give(state, requests)
+        await self._send_state(state, requests)
         if not self._gate.holds:
             raise NotMoved("move_failed", "it left its safe point because one of its holds ended")
         if self.called_off:
@@ -108,7 +108,7 @@ class OutgoingMove:
             self._client.internals.take_back()
             raise NotMoved("move_failed", words)
 
-    async def _give(self, state: bytes, requests: list[OpenRequest]) -> None:
+    async def _send_state(self, state: bytes, requests: list[OpenRequest]) -> None:
         order = messages.RestoreComponent(self._name, self.incarnation, state, requests)
         if len(messages.encode(order)) > MAX_MOVE:
             raise NotMoved("too_large", f"state and {len(requests)} requests are more than {MAX_MOVE} bytes")

@@ -21,7 +21,7 @@ ROUNDS: Final = 20
 DYING: Final = 1.0
 """Seconds to wait for killed processes: one that hangs in the kernel may never die."""
 MAX_ENVIRONMENT: Final = 4_000_000
-"""Bytes."""
+"""Most bytes read of a process's environment."""
 
 
 def kill_family(tag: str, *, spare: int = 0) -> int:
