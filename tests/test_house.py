@@ -32,7 +32,7 @@ HEADLESS = (
 """A clause without its noun: who holds it, what was asked."""
 PLAIN = [
     *("studies/chaos", "studies/placement", "studies/scheduling"),
-    *("zscout/behaviors", "zscout/drivers"),
+    *("zscout/behaviors", "zscout/cli", "zscout/drivers"),
     *("zscout/components", "zscout/config", "zscout/placement", "zscout/simulation", "zscout/testing"),
     *("zscout/mesh", "zscout/messages", "zscout/services/bookings", "zscout/services/node"),
     *("zscout/services/journal", "zscout/services/metrics", "zscout/services/notify", "zscout/services/placement"),

@@ -291,7 +291,7 @@ async def test_status_says_that_roles_are_advisory_where_nothing_proves_a_name(t
         lab.node("anvil")
         await lab.ready(await lab.client())
         done = await lab.zscout("status")
-        assert "roles  they are only advisory: set [security], so that names are proved" in done.stdout
+        assert "roles  they are only advisory; set [security] to prove names" in done.stdout
         assert json.loads((await lab.zscout("status", "--json")).stdout)["advisory"] is True
 
 

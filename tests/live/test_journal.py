@@ -161,7 +161,7 @@ async def test_what_was_held_is_known_after_a_node_is_killed(tmp_path: Path) -> 
         await lab.living(client, Role.RCM, lambda hosts: hosts == ["anvil"])
         why = await lab.zscout("why", "take")
         assert why.returncode == 0
-        assert why.stdout.startswith("take is not open any more\nHolds, from the journals of the candidates\n")
+        assert why.stdout.startswith("take is no longer open\nHolds, from the journals of the candidates\n")
         assert "priority 10, held robot/b\n" in why.stdout
         as_json = json.loads((await lab.zscout("why", survey.id, "--json")).stdout)
         (arc,) = as_json["arcs"]

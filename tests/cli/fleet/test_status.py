@@ -261,7 +261,7 @@ async def test_without_an_rcm_it_shows_what_is_there_and_says_so(lab: Lab) -> No
 
     shown = await zscout_soon_until(all_seen, "status", env=lab.env)
     assert shown.returncode == 3
-    assert "nobody leads" in shown.stdout
+    assert "no leader" in shown.stdout
     assert shown.stderr.startswith(f"zscout: no leader is on the mesh of fleet {lab.fleet.name}")
     assert len(shown.stderr.splitlines()) == 1
 

@@ -18,7 +18,7 @@ from tests import transcripts
 from tests.cli.test_words import NOW, Stopped
 from zscout import terminal
 from zscout.cli.fleet.fleet_view import Devices, FleetView, Host
-from zscout.cli.fleet.status import Standing
+from zscout.cli.fleet.status import StatusView
 from zscout.config.access import AccessPolicy
 from zscout.keyexpr import Role, Token
 from zscout.messages import (
@@ -202,7 +202,7 @@ class Picture:
         )
         devices = cast("Devices", SimpleNamespace(known=lambda: self.health))
         names = [word for word in words if word != "--devices"]
-        shown = Standing(cast("FleetView", seen), self.state, devices, "--devices" in words, names, self.booked)
+        shown = StatusView(cast("FleetView", seen), self.state, devices, "--devices" in words, names, self.booked)
         if width == "lines":
             plain = shown.overview(plain=True)
             return [f"|{line}" for table in plain.tables if table.rows for line in table.lines()]

@@ -40,7 +40,7 @@ def test_it_says_when_it_would_start_and_whom_it_would_preempt(fleet: CliFleet) 
 def test_what_would_never_start_is_said_with_code_1(fleet: CliFleet) -> None:
     done = fleet.zscout("request", "robot/zz", "--dry-run", "--wait-for-device")
     assert done.returncode == 1
-    assert done.stdout == ("request would wait, and no start can be foretold: robot/zz not on the mesh\n")
+    assert done.stdout == ("request would wait, and no start can be estimated: robot/zz not on the mesh\n")
 
 
 def test_status_and_why_tell_when_a_waiting_one_may_start(fleet: CliFleet) -> None:

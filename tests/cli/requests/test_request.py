@@ -21,7 +21,7 @@ from tests.hang import HANG
 from tests.live.bench import until
 from zscout.behaviors.client.client import QUERY_TIMEOUT, Client
 from zscout.behaviors.client.request import OpenArc
-from zscout.cli.requests.request import REFRESH, Report, _yours
+from zscout.cli.requests.request import REFRESH_INTERVAL_S, Report, _yours
 from zscout.mesh import clock
 from zscout.messages import RcmState
 from zscout.types import SECOND
@@ -80,7 +80,7 @@ def test_in_a_pipe_it_says_once_who_is_in_the_way(fleet: CliFleet) -> None:
 
 def test_a_start_that_nobody_can_foretell_is_said_to_be_so(fleet: CliFleet) -> None:
     never = ("never", "robot/nowhere", "--wait-for-device")
-    assert fleet.waits(*never) == "never waits: robot/nowhere not on the mesh; no start can be foretold"
+    assert fleet.waits(*never) == "never waits: robot/nowhere not on the mesh; no start can be estimated"
     (waits,) = events(fleet.waits(*never, "--json"))
     assert (waits["event"], waits["starts_in"]) == ("waits", None)
 
@@ -110,7 +110,7 @@ def test_an_estimate_that_ticks_down_prints_nothing_and_asks_for_nothing(fleet: 
                 arc = await client.request("next", {"robot/a": {}}, estimate=True)
                 telling = asyncio.ensure_future(report.follow_wait())
                 await until(lambda: bool(out.getvalue()))
-                end_of_news = clock.now() + 2 * REFRESH * SECOND
+                end_of_news = clock.now() + 2 * REFRESH_INTERVAL_S * SECOND
                 while clock.now() < end_of_news:
                     report.news(arc)
                     await asyncio.sleep(0.01)
@@ -175,7 +175,7 @@ def test_again_asks_anew_for_what_was_kept_and_ended_for_another(fleet: CliFleet
     first = said_first[-1]
     assert fleet.zscout("request", "robot/b", "--", "true").returncode == 0
     lines = read_until(kept, "run ")
-    assert any(line.endswith("; asking anew") for line in lines)
+    assert any(line.endswith("; asking again") for line in lines)
     assert lines[-1] != first
     assert kept.wait(HANG) == 4
 

@@ -39,7 +39,7 @@ News = tuple[str, ReasonInfo, int]
 
 def printed(monkeypatch: pytest.MonkeyPatch, *courses: News, as_json: bool = False, pause: float = 0.0) -> list[str]:
     """The lines for what a waiting request learns, one after the other."""
-    monkeypatch.setattr(request, "REFRESH", 0.02)
+    monkeypatch.setattr(request, "REFRESH_INTERVAL_S", 0.02)
     out, looks = io.StringIO(), 0
 
     async def state() -> RcmState:
@@ -56,7 +56,7 @@ def printed(monkeypatch: pytest.MonkeyPatch, *courses: News, as_json: bool = Fal
         arc = OpenArc("b1", "next", {"gpu/0": {}}, 0, Decimal(60), keep=True)
         arc.state, arc.since = "queued", now()
         with Report("next", cast("Client", client), as_json=as_json, stream=out) as report:
-            async with report.telling(report.follow_wait()):
+            async with report.following(report.follow_wait()):
                 for arc.reason, arc.why, arc.ahead in courses:
                     arc._notified_at, arc.start = now(), now() + 1200 * SECOND
                     report.news(arc)

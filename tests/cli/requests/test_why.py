@@ -80,7 +80,7 @@ async def test_the_story_of_an_arc(lab: Lab) -> None:
     await client.end(survey)
     ended = await zscout_soon("why", "survey", env=lab.env)
     assert ended.returncode == 0
-    assert ended.stdout.startswith("survey is not open any more\nStory\n")
+    assert ended.stdout.startswith("survey is no longer open\nStory\n")
     assert "cancelled" in ended.stdout.splitlines()[-1]
     unknown = await zscout_soon("why", "mappin", env=lab.env)
     assert (unknown.returncode, unknown.stdout) == (1, "")
@@ -102,6 +102,6 @@ async def test_how_long_such_holds_usually_last_is_told(lab: Lab) -> None:
     await client.request("survey", {"robot/a": {}}, min_runtime=600)
     await lab.state(client, lambda state: len(state.holds) == 1)
     why = await zscout_soon("why", "survey", env=lab.env)
-    assert re.search(rf"^  it is likely to be given back at {CLOCK} \(in ", why.stdout, re.MULTILINE)
+    assert re.search(rf"^  likely to end at {CLOCK} \(in ", why.stdout, re.MULTILINE)
     status = await zscout_soon("status", env=lab.env)
     assert re.search(rf", keeps, likely {CLOCK}", status.stdout)

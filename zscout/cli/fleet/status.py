@@ -26,7 +26,7 @@ from zscout.terminal import Table, clock, many, span
 from zscout.types import SECOND, VERSION, Ns
 
 MAX_NAMED: Final = 8
-"""Components in the row of a host, and hosts of one version."""
+"""Components named in the row of a host; hosts named for a version."""
 NODE_ROLES: Final = (Role.NODE, Role.CANDIDATE, Role.RCM, Role.RC, Role.LOAD, Role.RECORDER)
 """Roles of a node, not of programs on its host."""
 MAX_FIGURES_SHOWN: Final = 12
@@ -34,29 +34,27 @@ MAX_FIGURES_SHOWN: Final = 12
 
 @click.command()
 @click.argument("names", nargs=-1, metavar="[NAME...]", shell_complete=completion.shown)
-@click.option("--watch", is_flag=True, help="Refresh it all the time: the arrows scroll, q or Ctrl-C ends.")
+@click.option("--watch", is_flag=True, help="Update continuously; arrows scroll, q or Ctrl-C ends.")
 @click.option("--devices", "every", is_flag=True, help="Show the figures of all devices: rates, drops, latency.")
 @common.json_option("Print one JSON object; with --watch, one on each line.")
 @common.runs
 async def status(names: Sequence[str], watch: bool, every: bool, as_json: bool) -> None:
-    """Show the fleet: devices and the requests that hold them, the queue and what each request waits for, hosts and
-    their loads.
+    """Show the fleet: devices and the requests that hold them, the queue with reasons, hosts and their loads.
 
-    A NAME is that of a device, a request (or its id) or a host, or a pattern: 'robot/*'. With names, only these are
-    shown and what they are linked to: a device with the requests that hold it or wait for it, a request with its
-    devices and their holders, a host with its devices and programs. Exit code 1: nothing has one of these names.
+    NAME is the name of a device, a request (or its id) or a host, or a pattern: 'robot/*'. With names, only these and
+    everything linked to them are shown: a device with the requests that hold it or wait for it, a request with its
+    devices and their holders, a host with its devices and programs. Exit code 1: a name is unknown.
 
     HELD BY shows requests by the names that `zscout why`, `cancel` and `release` take, and their persons; `zscout why`
     also shows their commands. For a free device it shows the next booking within 24 h. A narrow terminal leaves out
     less important columns; a pipe gets all of them.
 
-    Warnings come first: certificates that end within 14 days, roles without [security], hosts whose roles differ or
+    Warnings come first: certificates that expire within 14 days, roles without [security], hosts whose roles differ or
     whose files have an error, clocks that differ by more than 2 s, different versions. The queue is in rank order,
-    and so are the groups where shares are fair. Candidates of the fleet file are shown even if they are down; other
-    hosts that went down only with --watch. The health of a device is shown if something is wrong with it, if it is
-    gone (for a day, or always if the fleet file expects it), or if several hosts offer it. --watch refreshes once a
-    second; in a pipe it prints a new block if more has changed than loads, times and figures. Exit code 3: no
-    leader.
+    and so are groups with fair shares. Candidates of the fleet file are shown even if they are down; other hosts that
+    went down only with --watch. A device has a line under Health if something is wrong with it, if it is absent (for a
+    day, or always if the fleet file expects it), or if several hosts offer it. --watch refreshes once a second; in a
+    pipe it prints a new block if more has changed than loads, times and figures. Exit code 3: no leader.
 
     \b
     Examples:
@@ -68,27 +66,27 @@ async def status(names: Sequence[str], watch: bool, every: bool, as_json: bool) 
     async with AsyncExitStack() as stack:
         client = await stack.enter_async_context(common.connected("status", need_rcm=False))
         fleet_view = stack.enter_context(FleetView(client))
-        standing = Standing(fleet_view, None, Devices(fleet_view), every, names)
+        status_view = StatusView(fleet_view, None, Devices(fleet_view), every, names)
         nobody: common.NobodyThere | None = None
         try:
-            standing.state = await fleet_view.settled()
-        except common.NobodyThere as error:  # hosts and devices are shown all the same
+            status_view.state = await fleet_view.settled()
+        except common.NobodyThere as error:  # show hosts and devices without a leader
             nobody = error
-        await asyncio.gather(standing.devices.ask(), standing.ask_bookings())
-        if nobody is None and not watch and (missing := standing.selection().missing()):
+        await asyncio.gather(status_view.devices.ask(), status_view.ask_bookings())
+        if nobody is None and not watch and (missing := status_view.selection().missing()):
             raise missing
         # Each change of a request is published to its client.
         news = asyncio.Event()
         client.mesh.subscribe(client.mesh.keys.notice_any, Notice, lambda _key, _notice: news.set())
-        await show(standing, news, standing.refresh, watch=watch, as_json=as_json)
+        await show(status_view, news, status_view.refresh, watch=watch, as_json=as_json)
         if nobody is not None and not watch:
             raise nobody
 
 
 @dataclass(slots=True)
-class Standing:
-    """What is known of the fleet; `state` is None if no node leads. `every`: show figures of all devices. `names`: if
-    there are some, show only these."""
+class StatusView:
+    """The state of the fleet as `zscout status` shows it. `state`: None if no node leads. `every`: show figures of all
+    devices. `names`: if not empty, show only these."""
 
     fleet_view: FleetView
     state: RcmState | None
@@ -98,7 +96,7 @@ class Standing:
     booked: BookingsTold | None = None
 
     def selection(self) -> Selection:
-        """The part of the fleet that is to be shown."""
+        """Return the part of the fleet to show."""
         return Selection(self.names, self.state, self._homes(), self.fleet_view.all_hosts())
 
     async def refresh(self) -> None:
@@ -113,7 +111,7 @@ class Standing:
         """`plain`: for a pipe, in the columns that scripts read."""
         plain = not terminal.at_terminal() if plain is None else plain
         fleet, links = self.fleet_view.client.fleet.name, many(self.fleet_view.mesh.links(), "link")
-        headline = f"Fleet {fleet}: nobody leads; nothing is granted until a node does ({links})"
+        headline = f"Fleet {fleet}: no leader; nothing is granted until a node leads ({links})"
         tables: list[Table] = []
         chosen = self.selection()
         if self.state is not None and chosen.state is not None:
@@ -126,7 +124,7 @@ class Standing:
             tables = [self._rcs(chosen.state), held, waiting(chosen.state, ranks, plain=plain)]
             tables += [] if self.names else [shares_table(self._shares())]
         tables = [self._warnings(), *tables, self._hosts(chosen), self._devices(chosen)]
-        if not plain:  # the heads name what stands below them
+        if not plain:  # at a terminal the columns are clear without titles
             tables = [replace(table, title="") for table in tables]
         return Overview(headline, tables, alarm=self.state is None)
 
@@ -145,7 +143,7 @@ class Standing:
             for name, left in self.fleet_view.ending().items()
         ]
         if self._advisory():
-            rows.append(("roles", "they are only advisory: set [security], so that names are proved"))
+            rows.append(("roles", "they are only advisory; set [security] to prove names"))
         rows += [("roles", words) for words in differing(self._own_rights(), self.fleet_view.rights())]
         rows += [("files", f"{host} uses older settings: {fault}") for host, fault in self.fleet_view.faults().items()]
         rows += [("recorder", f"{host}: {why}") for host, why in self.fleet_view.unrecorded().items()]
@@ -164,7 +162,7 @@ class Standing:
         return versions(self.fleet_view.hosts, self.devices.known(), self.state)
 
     def _homes(self) -> dict[str, str]:
-        """The host of each device's named instance, or one that offers the device if the leader names none."""
+        """Return the host of each device: the leader's choice, else a host that offers the device."""
         offered = {token.name: token.host for token in self.fleet_view.tokens(Role.RC)}
         views = self.state.rcs if self.state is not None else []
         return offered | {view.rc: view.host for view in views if view.host}
@@ -223,17 +221,17 @@ class Standing:
         return (f"{words}, cordoned", "yellow") if name in self.fleet_view.placer.cordoned else (words, style)
 
     def _devices(self, chosen: Selection) -> Table:
-        """Health and figures: of devices with remarks, with `every` of all that report figures."""
+        """Return the table of health and figures: of devices with remarks; with `every` of all that report figures."""
         known, broken = self.devices.known(), booked.broken(self.booked)
-        said = {view.rc: list(remarks(view)) for view in (self.state.rcs if self.state is not None else ())}
+        noted = {view.rc: list(remarks(view)) for view in (self.state.rcs if self.state is not None else ())}
         rows, styles = [], []
-        for rc in filter(chosen.shows, sorted(known.keys() | said.keys() | broken.keys())):
-            device, words = known.get(rc), said.get(rc, [])
+        for rc in filter(chosen.shows, sorted(known.keys() | noted.keys() | broken.keys())):
+            device, words = known.get(rc), noted.get(rc, [])
             figures = device.figures if device is not None else {}
             if device is not None and device.health != "ok":
                 words = words if words and words[0].startswith(device.health) else [device.health, *words]
-            told = f"broken: {broken[rc]}" if rc in broken else ""
-            words = [*filter(None, (unwell(device), told)), *words]
+            report = f"broken: {broken[rc]}" if rc in broken else ""
+            words = [*filter(None, (unwell(device), report)), *words]
             if frozen := figures.get("frozen_seconds"):
                 words = [*words, f"frozen: the same picture for {span(frozen)}"]
             if words or (self.every and figures):
@@ -242,11 +240,13 @@ class Standing:
         return Table("Health", ("DEVICE", "HEALTH", "FIGURES"), rows, styles)
 
     def as_object(self) -> dict[str, Any]:
-        """The output of `--json`, spans in seconds and memory in bytes; `rcm` is null if no node leads. `advisory`:
-        rights are listed and not enforced; `rights`: hosts by the digest of those they enforce, `own_rights`: that of
-        this fleet file; `faults`: why a host uses older settings than its files have; `unrecorded`: why a host's
-        recorder writes nothing; `ending`: certificates that end soon; `clocks`: how far hosts' clocks differ from fleet
-        time; `booked_soon`: dates of bookings within 24 h."""
+        """Return the object of `--json`, durations in seconds and memory in bytes.
+
+        rcm: null if no node leads. advisory: rights are listed and not enforced. rights: hosts by the digest of the
+        rights that they enforce. own_rights: the digest of this fleet file. faults: reasons that hosts use older
+        settings than their files have. unrecorded: reasons that recorders of hosts write nothing. ending: certificates
+        that expire soon. clocks: differences of hosts' clocks from fleet time. booked_soon: dates of bookings within
+        24 h."""
         chosen, versions = self.selection(), self._versions()
         state, homes, now = chosen.state, self._homes(), self.fleet_view.mesh.now()
         holds, views, queue = (state.holds, state.rcs, state.queue) if state is not None else ([], [], [])
@@ -269,7 +269,7 @@ class Standing:
         return {
             "fleet": self.fleet_view.client.fleet.name,
             "version": VERSION,
-            "versions": [{"version": told or None, "hosts": hosts} for told, hosts in by_version(versions).items()],
+            "versions": [{"version": known or None, "hosts": hosts} for known, hosts in by_version(versions).items()],
             "links": self.fleet_view.mesh.links(),
             "advisory": self._advisory(),
             "rights": [{"digest": digest, "hosts": hosts} for digest, hosts in self.fleet_view.rights().items()],
@@ -307,46 +307,49 @@ class Standing:
 
 
 def shares(charged: Mapping[str, float], weights: Mapping[str, float]) -> list[dict[str, Any]]:
-    """Recent contended usage per group in RC-seconds, the group that is next to be served first."""
+    """Return the recent contended usage by group in RC-seconds; the group to be served next comes first."""
     total = sum(charged.values())
     found = [
         {"group": group, "charged": had, "part": had / total if total else 0.0, "weight": weights.get(group, 1.0)}
         for group, had in charged.items()
     ]
-    return sorted(found, key=lambda one: (one["charged"] / one["weight"], one["group"]))
+    return sorted(found, key=lambda share: (share["charged"] / share["weight"], share["group"]))
 
 
 def shares_table(found: Sequence[Mapping[str, Any]]) -> Table:
     rows = [
-        (one["group"], f"{one['charged']:,.0f}", f"{100 * one['part']:.1f} %", f"{one['weight']:g}") for one in found
+        (share["group"], f"{share['charged']:,.0f}", f"{100 * share['part']:.1f} %", f"{share['weight']:g}")
+        for share in found
     ]
     return Table("Shares", ("GROUP", "DEVICE-SECONDS", "PART", "WEIGHT"), rows)
 
 
 def versions(hosts: Mapping[str, Host], devices: Mapping[str, RcState], state: RcmState | None) -> dict[str, str]:
-    """The version of each host's node; empty if the node is too old to publish it."""
+    """Return the version of each host's node; empty if the node is too old to publish it."""
     loads = {name: host.load for name, host in hosts.items() if host.has(Role.LOAD)}
-    told = {name: load.version for name, load in loads.items() if load is not None}
-    # An RC that publishes no version may be a foreign one.
-    told |= {device.host: device.version for device in devices.values() if device.version}
-    return told | ({} if state is None else {state.host: state.version})
+    found = {name: load.version for name, load in loads.items() if load is not None}
+    # An RC without a version may be foreign.
+    found |= {device.host: device.version for device in devices.values() if device.version}
+    return found | ({} if state is None else {state.host: state.version})
 
 
 def by_version(versions: Mapping[str, str]) -> dict[str, list[str]]:
-    """The hosts of each version."""
-    return {told: sorted(host for host in versions if versions[host] == told) for told in sorted(versions.values())}
+    """Return the hosts by version."""
+    return {
+        version: sorted(host for host in versions if versions[host] == version) for version in sorted(versions.values())
+    }
 
 
 def mixture(versions: Mapping[str, str]) -> str | None:
-    """A warning if nodes and this program are of different versions."""
+    """Return a warning if versions of nodes and this program differ."""
     if set(versions.values()) <= {VERSION}:
         return None
-    parts = [f"{version_words(told)} on {_some(hosts)}" for told, hosts in by_version(versions).items()]
+    parts = [f"{version_words(version)} on {_some(hosts)}" for version, hosts in by_version(versions).items()]
     return f"they differ: {'; '.join(parts)}; this zscout is {VERSION}"
 
 
 def differing(own: str, rights: Mapping[str, list[str]]) -> list[str]:
-    """Warnings about hosts that enforce other rights than the own fleet file has."""
+    """Return warnings about hosts that enforce other rights than the own fleet file has."""
     copy = "copy the fleet file to all hosts, and reload their nodes (SIGHUP)"
     if own and len(rights) == 1 and own not in rights:
         return [f"all hosts enforce other roles than this fleet file; take theirs, or {copy}"]
@@ -362,7 +365,7 @@ def _some(hosts: Sequence[str]) -> str:
 def running(
     state: RcmState, operator_priority: int, *, plain: bool, maintained: Collection[str] = frozenset()
 ) -> Table:
-    """`maintained`: devices in maintenance, at which a hold ends with its minimum runtime."""
+    """Return the table of holds. maintained: devices in maintenance, whose holds end with their minimum runtimes."""
     rows, styles = [], []
     for hold in sorted(state.holds, key=lambda hold: (-hold.priority, -hold.held)):
         since = f"{clock(-hold.held)} ({span(hold.held)})"
@@ -386,7 +389,7 @@ def running(
 
 
 def waiting(state: RcmState, ranks: Mapping[str, int], *, plain: bool) -> Table:
-    """The queue in rank order, with each request's place in the whole queue."""
+    """Return the table of the queue in rank order, with each request's place in the whole queue."""
     rows = []
     for wait in state.queue:
         number = ranks[f"{wait.client}/{wait.id}"]
@@ -398,13 +401,13 @@ def waiting(state: RcmState, ranks: Mapping[str, int], *, plain: bool) -> Table:
     rest = f", and {state.more} more" if state.more else ""
     head, last = ("REQUEST", "CLIENT") if plain else (f"WAITING REQUEST{rest}", "COMMENT")
     columns = ("#", head, "WHO", "PRIORITY", "SINCE", "RUNTIME", "STARTS", "PREEMPTED", "WHY", last)
-    # Rows stand in rank order: priority and age add little where there is little room.
+    # Rows are in rank order: a narrow terminal can leave out priority and age.
     spare = ("WHY", last, "PREEMPTED", "RUNTIME", "SINCE", "PRIORITY", "WHO")
     return Table(f"Waiting{rest}", columns, rows, spare=spare, beneath={"WHY", "WHO", last})
 
 
 def _by(view: HoldView | WaitView, *, plain: bool) -> tuple[str, str]:
-    """WHO, and the last column: people read the comment there, and the command in `zscout why`."""
+    """Return WHO and the last column: the comment at a terminal, else the client."""
     if plain:
         return whose(view) + comment(view.who), view.client
     words = view.who.comment if view.who is not None else ""
@@ -416,7 +419,7 @@ def _doing(host: Host) -> str:
     parts += ["recorder"] if host.has(Role.RECORDER) else []
     rcs, components = sum(token.role == Role.RC for token in host.tokens), host.components
     parts += [many(rcs, "device")] if rcs else []
-    # Each component is a client too, `<component>.<incarnation>`, and is named below.
+    # Components are clients too, named `<component>.<incarnation>`, and are listed below.
     named = [token.name.rpartition(".") for token in host.tokens if token.role == Role.CLIENT]
     clients = sum(not (number.isdigit() and component in components) for component, _, number in named)
     parts += [many(clients, "client")] if clients else []
@@ -426,7 +429,7 @@ def _doing(host: Host) -> str:
 
 
 def figures_text(figures: Mapping[str, float]) -> str:
-    """Figures as people read them, without those that are 0: `frames_per_second=9.8, opened=1`."""
+    """Format the figures that are not 0: `frames_per_second=9.8, opened=1`."""
     parts = []
     for name, value in figures.items():
         if value:

@@ -1,4 +1,4 @@
-"""`zscout request`: waits for devices, and holds them for a time or for a command."""
+"""`zscout request`: wait for devices, and hold them for a time or for a command."""
 
 from __future__ import annotations
 
@@ -45,27 +45,27 @@ from zscout.terminal import LiveLine, clean, clock, print_json, print_line, span
 from zscout.types import SECOND, VERSION, Ns
 
 TAKEN_AWAY: Final = 75
-"""EX_TEMPFAIL: the grant was taken from the command; it may be tried again."""
+"""EX_TEMPFAIL: the grant was taken from the command; another try may succeed."""
 TIME_OVER: Final = 124
-"""As `timeout` has it: the command was ended because its time was over, and with a kept hold somebody waited."""
-ANSWERS: Final = 5.0
-"""Seconds in which a leader answers, or the next one leads and does, with --timeout 0."""
+"""As of `timeout`: the command was ended because its time was over (for a kept hold: and another request waited)."""
+ANSWER_TIMEOUT_S: Final = 5.0
+"""With --timeout 0: time for an answer of the leader, or of the next leader."""
 UNDECIDED: Final = (ReasonCode.VOTING, ReasonCode.SEARCHING)
-"""How a request waits that may be granted without anything changing."""
+"""Reasons of a request whose decision is still pending."""
 MAX_DATES_SHOWN: Final = 8
-LAST_WORD: Final = 0.5
-"""Seconds in which the RCM's word about a hold whose time is over arrives."""
-REFRESH: Final = 1.0
-"""Seconds between two looks at who holds what, at least; and where somebody watches, between two pictures."""
+LAST_NOTICE_TIMEOUT_S: Final = 0.5
+"""Time for the RCM's notice of a hold whose time is over."""
+REFRESH_INTERVAL_S: Final = 1.0
+"""Shortest time between two queries of the state, and between two drawings at a terminal."""
 
 
 @click.command(cls=CommandAfterDashes)
 @priority_option
-@click.option("--keep", is_flag=True, hidden=True, help="What happens without it as well.")
+@click.option("--keep", is_flag=True, hidden=True, help="Has no effect: it is the default.")
 @click.option("--booking", type=BOOKING, shell_complete=completion.bookings, help="Use this booking: its name or id.")
 @tolerate_option
 @yes_option
-@click.option("--dry-run", is_flag=True, help="Only print when it would start, and what it would preempt.")
+@click.option("--dry-run", is_flag=True, help="Only print the estimated start, and the requests to preempt.")
 @partial(hold_options, needs_required=False)
 @common.runs
 async def request(
@@ -79,18 +79,18 @@ async def request(
 
     Your hold is protected for the minimum runtime: until then only a request of higher priority takes the devices.
     After that you keep them until a request of equal or higher priority waits for one of them. --release-after
-    gives them back even if nobody waits.
+    releases them even if no request waits.
 
-    With --booking the request uses a booking, with its devices, priority and time, and waits for its next date. It
-    asks before it uses another user's; if stdin is not a terminal, add --yes.
+    With --booking the request uses a booking, with its devices, priority and time, and waits for its next date.
+    Before it uses another user's booking it asks; if stdin is not a terminal, add --yes.
 
-    With a COMMAND the devices are held while it runs, and given back when none of its processes is left. When its
+    With a COMMAND the devices are held while it runs, and released when none of its processes is left. When its
     time is over or the grant is taken away, the command and its processes get SIGTERM, and SIGKILL after the grace;
-    the same happens if zscout dies or hangs. The next holder waits until no process is left. --again then repeats
+    also if zscout dies or hangs. The next holder waits until no process is left. --again then repeats
     request and command. Without a COMMAND the devices are held until Ctrl-C or until the time is over.
 
     \b
-    The command finds in its environment:
+    Environment of the command:
       ZSCOUT_ARC, ZSCOUT_ARC_ID  name and id of the request
       ZSCOUT_RCS                 the devices, with spaces between
       ZSCOUT_BOUND               the device for each pattern, as JSON:
@@ -104,12 +104,12 @@ async def request(
     Exit code: the command's own (128 + n: ended by signal n), or
       75   the grant was taken away before its time
       124  its time was over: another request waited after the minimum runtime, or --release-after
-      126  it can't be executed           127  there is no such command
+      126  the command can't be executed  127  there is no such command
       1    not granted; without a command also: taken away    3  no leader
-      2    it can never start: an unknown device or parameter, or too much of one
-    With --infra-exit N it is N instead of 1, 2, 3, 75 and 124: all else is the command's own.
+      2    can never be granted: an unknown device or parameter, or more than a device has
+    With --infra-exit N it is N instead of 1, 2, 3, 75 and 124: all other codes are the command's own.
 
-    With a COMMAND zscout prints to stderr only. --json-file writes what happens as JSON lines, beside that.
+    With a COMMAND zscout prints to stderr only. --json-file also writes its events as JSON lines.
 
     \b
     Examples:
@@ -133,11 +133,11 @@ async def request(
         if booking is not None:
             given = click.get_current_context().get_parameter_source("priority") is not ParameterSource.DEFAULT
             wanted = await taking_up(client, wanted, name=name, priority=priority if given else None, yes=yes)
-        return await (_foresee(client, wanted) if dry_run else carry_out(client, wanted))
+        return await (_dry_run(client, wanted) if dry_run else carry_out(client, wanted))
 
 
 async def carry_out(client: Client, wanted: HoldOptions) -> int:
-    """Waits, holds, runs the command, gives back. Returns the exit code. Raises Failed, RequestRefused."""
+    """Wait, hold, run the command, release. Return the exit code. Raises Failed, RequestRefused."""
     stream = sys.stderr if wanted.command else sys.stdout
     client.who = wanted.asked_by(client.who)
     with Report(wanted.name, client, as_json=wanted.as_json, stream=stream, events=wanted.events) as report:
@@ -148,7 +148,7 @@ async def carry_out(client: Client, wanted: HoldOptions) -> int:
                 arc = await wait_for_grant(client, wanted, report, arc if arc is not None and arc.open else None)
                 code = await _use(client, wanted, report, arc)
             except CommandRefused as refused:
-                # A device did not know of the grant: the client has given it back.
+                # A device does not know the grant; the client has released it.
                 if not wanted.again:
                     lost = TAKEN_AWAY if wanted.command else 1
                     raise Failed(f"{wanted.name}: {refused}; try again", lost) from None
@@ -160,10 +160,13 @@ async def carry_out(client: Client, wanted: HoldOptions) -> int:
 
 
 async def wait_for_grant(client: Client, wanted: HoldOptions, report: Report, arc: OpenArc | None) -> OpenArc:
-    """Until it is granted. Raises Failed where it is not."""
+    """Wait until the request is granted. Raises Failed if it is not."""
     try:
         once = wanted.timeout == 0
-        async with report.telling(report.follow_wait()), asyncio.timeout(ANSWERS if once else wanted.timeout) as limit:
+        async with (
+            report.following(report.follow_wait()),
+            asyncio.timeout(ANSWER_TIMEOUT_S if once else wanted.timeout) as limit,
+        ):
             if arc is None:
                 arc = await client.request(
                     wanted.name,
@@ -199,16 +202,16 @@ async def _give_up_once_queued(client: Client, arc: OpenArc, limit: asyncio.Time
     """Let `limit` pass as soon as the leader has decided that `arc` waits."""
     loop = asyncio.get_running_loop()
     while arc.state != "queued" or _undecided(arc):
-        limit.reschedule(None if arc.state == "running" else loop.time() + ANSWERS)
+        limit.reschedule(None if arc.state == "running" else loop.time() + ANSWER_TIMEOUT_S)
         await client.changed(arc)
     limit.reschedule(loop.time())
 
 
 async def _use(client: Client, wanted: HoldOptions, report: Report, arc: OpenArc) -> int | None:
-    """Under the grant. Returns the exit code, or None: it was taken away, and is to be waited for again."""
+    """Use the grant. Return the exit code; None: it was taken away, and must be waited for again."""
     grant = arc.grant
     if grant is None:  # taken away since the RCs confirmed it
-        return await _taken(client, wanted, report, arc)
+        return await _after_loss(client, wanted, report, arc)
     held = Held(client, arc, grant)
     rcs, left, longest = held_text(held), held.remaining, client.fleet.scheduling.max_runtime
     details = {"id": arc.id, "rcs": held.rcs, "bound": held.bound, "keep": arc.keep}
@@ -224,7 +227,7 @@ async def _use(client: Client, wanted: HoldOptions, report: Report, arc: OpenArc
             else:
                 with _never_suspended(report):
                     noticing = report_notices(report, held, client)
-                    async with report.telling(report.follow_hold(arc)), common.beside(noticing):
+                    async with report.following(report.follow_hold(arc)), common.beside(noticing):
                         await held.over()
     except BaseException:
         await client.end(arc)
@@ -235,8 +238,8 @@ async def _use(client: Client, wanted: HoldOptions, report: Report, arc: OpenArc
         report.event("ended", f"{arc.name} gave back {rcs}", outcome="released", code=code)
         return code
     if held.active:
-        # By our clock its time is over; the RCM's own word is on its way.
-        await common.until(lambda: not held.active, report.changed, LAST_WORD)
+        # By this host's clock its time is over; wait for the RCM's notice.
+        await common.until(lambda: not held.active, report.changed, LAST_NOTICE_TIMEOUT_S)
     ending = ending_of(arc)
     if held.active or ending.outcome == "completed":
         why = ending.reason if arc.keep else "its time is over"
@@ -245,11 +248,11 @@ async def _use(client: Client, wanted: HoldOptions, report: Report, arc: OpenArc
         line = f"the time of {arc.name} is over" + (f": {why}" if arc.keep else "")
         details = {"outcome": "completed", "reason": why, "by": ending.by, "again": again}
         arc._finish("completed", why, client.mesh.now())
-        report.event("ended", f"{line}; asking anew" if again else line, **details)
+        report.event("ended", f"{line}; asking again" if again else line, **details)
         if again:
             return None
         return wanted.own_code(TIME_OVER) if wanted.command else 0
-    return await _taken(client, wanted, report, arc)
+    return await _after_loss(client, wanted, report, arc)
 
 
 async def tolerate(seconds: float, report: Report, held: Held) -> None:
@@ -291,8 +294,8 @@ async def _report_dates(report: Report, held: Held, client: Client) -> None:
 async def report_notices(
     report: Report, held: Held, client: Client, noticed: Callable[[HoldNotice, str], object] = lambda *_: None
 ) -> None:
-    """Report the next booking of each device, and what the hold yields to, until it is over; `noticed` is called with
-    each notice and its words."""
+    """Report the next booking of each device, and each notice until the hold is over; call `noticed` with each notice
+    and its words."""
     async with common.beside(_report_dates(report, held, client)):
         await _report_each(report, held, User.of(client), noticed)
 
@@ -312,7 +315,7 @@ async def _report_each(report: Report, held: Held, me: User, noticed: Callable[[
 
 @contextmanager
 def _never_suspended(report: Report) -> Iterator[None]:
-    """Ctrl-Z would lose what is held: this client could not confirm it any more."""
+    """Ignore Ctrl-Z: a suspended client can't confirm its holds, and loses them."""
     loop, text = asyncio.get_running_loop(), "not suspended: it would lose what it holds"
     loop.add_signal_handler(signal.SIGTSTP, report.event, "not_suspended", text)
     try:
@@ -322,7 +325,7 @@ def _never_suspended(report: Report) -> Iterator[None]:
 
 
 async def _run(wanted: HoldOptions, report: Report, held: Held, client: Client) -> int | None:
-    """Runs the command until it ends (its code), or until the hold is over and it has been ended (None)."""
+    """Run the command. Return its exit code; None: the hold is over, and the command was ended."""
     direct, program = client.internals.direct_hold(held.grant), wanted.command[0]
     until = direct.sure_until if direct is not None else None
     command = RunningCommand(wanted.command, environment(held, client), _grace(wanted, report, direct), until)
@@ -334,7 +337,7 @@ async def _run(wanted: HoldOptions, report: Report, held: Held, client: Client) 
 
     try:
         noticing = report_notices(report, held, client, partial(_signal, command, wanted.notify_signal))
-        async with command, common.beside(_tell_who_is_old(report, held, client, direct)), common.beside(noticing):
+        async with command, common.beside(_warn_not_settling(report, held, client, direct)), common.beside(noticing):
             if direct is not None:
                 direct.watch(follow)
                 follow(direct)
@@ -349,8 +352,8 @@ async def _run(wanted: HoldOptions, report: Report, held: Held, client: Client) 
         if direct is not None and command.gone:
             direct.returned()
     if command.why_ended == "deadline" and held.active and not held.completed:
-        # This process stood still then, and has not looked at its hold since.
-        await common.until(lambda: not held.active, report.changed, LAST_WORD)
+        # This process was stalled at the deadline, and has not checked its hold since.
+        await common.until(lambda: not held.active, report.changed, LAST_NOTICE_TIMEOUT_S)
         if held.active:
             await client.end(held.arc)
     return None
@@ -361,20 +364,20 @@ def _signal(command: RunningCommand, number: int | None, notice: HoldNotice, _te
         command.signal(number)
 
 
-async def _tell_who_is_old(report: Report, held: Held, client: Client, direct: DirectHold | None) -> None:
-    """Says who does not know that the next holder is to wait until the command is gone."""
+async def _warn_not_settling(report: Report, held: Held, client: Client, direct: DirectHold | None) -> None:
+    """Warn of an old leader or old devices, which don't let the next holder wait until the command has ended."""
     key, asked = client.mesh.keys.ask_state(client.mesh.me), StateAsk(holds_only=True)
     reply = await client.mesh.ask_one(key, asked, RcmState, timeout=QUERY_TIMEOUT)
     state, who = reply.message if reply is not None else None, [] if direct is None else direct.never_settle
     if state is not None and any(hold.grant == held.grant and not hold.direct for hold in state.holds):
         who = [f"the leader at {state.host} ({version_words(state.version)}, this is {VERSION})", *who]
     if who:
-        told = f"the next holder may begin before the command is gone: {', '.join(who)} can't make it wait; upgrade"
-        report.event("not_settling", told, who=who)
+        text = f"the next holder may begin before the command is gone: {', '.join(who)} can't make it wait; upgrade"
+        report.event("not_settling", text, who=who)
 
 
 def _grace(wanted: HoldOptions, report: Report, direct: DirectHold | None) -> float:
-    """Seconds from SIGTERM to SIGKILL: no more than the RCs wait."""
+    """Return the seconds from SIGTERM to SIGKILL, at most those for which the RCs settle."""
     most = float((direct.grace if direct is not None else DEFAULT_SETTLE) / SECOND)
     grace, text = grace_within(wanted.grace, most)
     if text:
@@ -382,10 +385,11 @@ def _grace(wanted: HoldOptions, report: Report, direct: DirectHold | None) -> fl
     return grace
 
 
-async def _taken(client: Client, wanted: HoldOptions, report: Report, arc: OpenArc) -> int | None:
-    """The grant was taken away. Raises Failed where there is no command and no second try."""
+async def _after_loss(client: Client, wanted: HoldOptions, report: Report, arc: OpenArc) -> int | None:
+    """Report that the grant was taken away. Return the exit code, or None to wait again. Raises Failed if there is
+    neither a command nor --again."""
     ending = ending_of(arc)
-    # What lost an RC after its minimum runtime is not queued again.
+    # A hold that lost an RC after its minimum runtime is not queued again.
     again = wanted.again and (arc.open or ending.outcome == "lost")
     line = f"{arc.name} lost its grant: {ending.reason or ending.outcome}"
     details = {"outcome": ending.outcome, "reason": ending.reason, "by": ending.by, "again": again}
@@ -401,9 +405,9 @@ async def _taken(client: Client, wanted: HoldOptions, report: Report, arc: OpenA
 
 
 def _yours(arc: OpenArc, left: float, longest: Ns | None) -> str:
-    """For how long a hold goes on, of which so many seconds are protected; `longest` as the fleet allows."""
-    goes_on = arc.keep and (longest is None or arc.min_runtime * SECOND < longest)
-    then = _kept(longest, arc.priority) if goes_on else "given back"
+    """Words for the rest of a hold. left: protected seconds. longest: the fleet's maximum runtime."""
+    continues = arc.keep and (longest is None or arc.min_runtime * SECOND < longest)
+    then = _kept(longest, arc.priority) if continues else "given back"
     return f"yours for {span(left)} (until {clock(left)}), then {then}"
 
 
@@ -415,39 +419,39 @@ def ending_of(arc: OpenArc) -> HoldEnd:
     return arc._ending or HoldEnd("lost", "")
 
 
-async def _foresee(client: Client, wanted: HoldOptions) -> int:
-    """Prints when it would start and whom it would preempt at once. Exit code 1: it would not start. Raises
-    RequestRefused, NobodyThere."""
-    foretold = await client.foresee(wanted.name, wanted.needs, **wanted.terms())
-    if foretold is None:
+async def _dry_run(client: Client, wanted: HoldOptions) -> int:
+    """Print the estimated start and the requests that it would preempt now. Return 1 if no start can be estimated.
+    Raises RequestRefused, NobodyThere."""
+    predicted = await client.foresee(wanted.name, wanted.needs, **wanted.terms())
+    if predicted is None:
         raise common.NobodyThere(f"the leader of fleet {client.fleet.name} did not answer; try again")
     dates = next_dates(await look(client), wanted.needs)
     if wanted.as_json:
         found = {
-            name: getattr(foretold, name)
+            name: getattr(predicted, name)
             for name in ("starts_in", "begin_within", "preempts", "victims", "reason", "why")
         }
         print_json({"arc": wanted.name, **found, "dates": [date._asdict() for date in dates]})
     else:
-        for line in (*_words(foretold, User.of(client)), *map(str, dates[:MAX_DATES_SHOWN])):
+        for line in (*_words(predicted, User.of(client)), *map(str, dates[:MAX_DATES_SHOWN])):
             print_line(clean(line))
-    return 0 if foretold.starts_in is not None else wanted.own_code(1)
+    return 0 if predicted.starts_in is not None else wanted.own_code(1)
 
 
-def _words(foretold: Foresight, me: User) -> Iterator[str]:
-    reason, start = reason_text(foretold.reason, foretold.why, me=me), foretold.starts_in
+def _words(predicted: Foresight, me: User) -> Iterator[str]:
+    reason, start = reason_text(predicted.reason, predicted.why, me=me), predicted.starts_in
     if start is None:
-        yield f"{foretold.arc} would wait, and no start can be foretold: {reason}"
+        yield f"{predicted.arc} would wait, and no start can be estimated: {reason}"
     elif reason:
-        yield f"{foretold.arc} would start at {clock(start)} (in {span(start)}), if nothing else comes"
+        yield f"{predicted.arc} would start at {clock(start)} (in {span(start)}), if nothing else comes"
         yield f"until then: {reason}"
     else:
-        yield f"{foretold.arc} would start at once"
-    if start is not None and foretold.begin_within:
-        yield f"then it is {starting(foretold.begin_within)}"
-    if foretold.preempts:
-        told = [request_words(victim.arc, victim.who, victim.client, me=me) for victim in foretold.victims]
-        yield f"it would preempt {', '.join(told or foretold.preempts)}"
+        yield f"{predicted.arc} would start at once"
+    if start is not None and predicted.begin_within:
+        yield f"then it is {starting(predicted.begin_within)}"
+    if predicted.preempts:
+        victims = [request_words(victim.arc, victim.who, victim.client, me=me) for victim in predicted.victims]
+        yield f"it would preempt {', '.join(victims or predicted.preempts)}"
 
 
 class Report(LiveLine):
@@ -466,16 +470,16 @@ class Report(LiveLine):
         self._settling: object = None
         """The grant whose start was reported."""
         self._state: RcmState | None = None
-        """As it was `_looked` at, when `_seen` was the newest notice."""
-        self._looked: Ns | None = None
-        self._seen: object = None
+        """The state at `_fetched_at`, when `_fetched_for` was the newest notice."""
+        self._fetched_at: Ns | None = None
+        self._fetched_for: object = None
 
     def event(self, kind: str, text: str, /, **details: Any) -> None:
-        """Reports one event: `text` for people (empty: nothing), the rest for programs."""
+        """Report an event: `text` for people (empty: no line), the rest for programs."""
         event = {"event": kind, "arc": self._name, "client": str(self._mesh.me)} | details
         if self._events is not None:
             self._events.write(event)
-        # What a command does, and its exit code, do not depend on who reads what is said beside it.
+        # A closed stderr must not change the command or its exit code.
         with suppress(OSError) if self._stream is sys.stderr else nullcontext():
             if self._as_json:
                 print_json(event, self._stream)
@@ -487,8 +491,8 @@ class Report(LiveLine):
         self.changed.set()
 
     @asynccontextmanager
-    async def telling(self, follow: Coroutine[Any, Any, None]) -> AsyncIterator[None]:
-        """Runs `follow_wait` or `follow_hold` for as long as the context lasts."""
+    async def following(self, follow: Coroutine[Any, Any, None]) -> AsyncIterator[None]:
+        """Run `follow_wait` or `follow_hold` while the context is open."""
         try:
             async with common.beside(follow):
                 yield
@@ -498,9 +502,9 @@ class Report(LiveLine):
     async def follow_wait(self) -> None:
         self._printed = None
         while True:
-            if self._looked is not None and self._arc is not None and self._arc.state == "queued":
-                # One look per REFRESH: news may come in a crowd.
-                await asyncio.sleep(REFRESH - (self._mesh.now() - self._looked) / SECOND)
+            if self._fetched_at is not None and self._arc is not None and self._arc.state == "queued":
+                # One query per interval: many notices may come at once.
+                await asyncio.sleep(REFRESH_INTERVAL_S - (self._mesh.now() - self._fetched_at) / SECOND)
             self.changed.clear()
             arc = self._arc
             if arc is None:
@@ -508,18 +512,18 @@ class Report(LiveLine):
             elif arc.state == "running" and (arc._settling == arc.grant or arc.ready is not None):
                 self._show_settling(arc)
             elif arc.state in ("asking", "queued") and arc.reason:
-                if not self.watched and _undecided(arc) and await done_within(REFRESH, self.changed.wait()):
-                    continue  # decided a moment later
-                news = arc._last != self._seen if self.watched else _how(arc) != self._printed
+                if not self.watched and _undecided(arc) and await done_within(REFRESH_INTERVAL_S, self.changed.wait()):
+                    continue  # a decision came within the interval
+                news = arc._last != self._fetched_for if self.watched else _how(arc) != self._printed
                 if arc.state == "queued" and news:
-                    self._looked, self._seen = self._mesh.now(), arc._last
+                    self._fetched_at, self._fetched_for = self._mesh.now(), arc._last
                     self._state = await self._client.state()
                 if arc.state in ("asking", "queued"):
                     self._show_wait(arc)
-            await done_within(REFRESH if self.watched else None, self.changed.wait())
+            await done_within(REFRESH_INTERVAL_S if self.watched else None, self.changed.wait())
 
     async def follow_hold(self, arc: OpenArc) -> None:
-        """Shows how long a hold without a command goes on, until cancelled."""
+        """Show the rest of a hold without a command, until cancelled."""
         longest = self._client.fleet.scheduling.max_runtime
         while True:
             self.changed.clear()
@@ -533,7 +537,7 @@ class Report(LiveLine):
             )
             rest = rest if arc.ready is None else starting((arc.ready - now) / SECOND)
             self.draw(f"{arc.name} holds {held_text(arc)}: {rest}\n  Ctrl-C gives back")
-            await done_within(REFRESH if self.watched else None, self.changed.wait())
+            await done_within(REFRESH_INTERVAL_S if self.watched else None, self.changed.wait())
 
     def _show_wait(self, arc: OpenArc) -> None:
         now, start, starts_in, me = self._mesh.now(), "", None, User.of(self._client)
@@ -541,18 +545,18 @@ class Report(LiveLine):
         if arc.start is not None:
             starts_in = round(max(0, arc.start - now) / SECOND, 3)
         if arc.state == "queued":
-            start = "no start can be foretold"
+            start = "no start can be estimated"
             if starts_in is not None:
                 start = f"starts at {clock(starts_in)} (in {span(starts_in)})"
-            if self._state is not None and self._looked is not None:
-                # The state as it is now, if nothing has happened since that look.
-                past = (now - self._looked) / SECOND
+            if self._state is not None and self._fetched_at is not None:
+                # The state now, if nothing has happened since it was fetched.
+                past = (now - self._fetched_at) / SECOND
                 holds = [
                     replace(hold, held=hold.held + past, remaining=hold.remaining - past) for hold in self._state.holds
                 ]
                 needs = contention_of(replace(self._state, holds=holds), arc.needs, f"{self._mesh.me}/{arc.id}")
-        # A sharable RC has holders who are in nobody's way, unless the reason names it. Two patterns may be
-        # met by one RC: it is listed once.
+        # Holders of a sharable RC are not in the way unless the reason names the RC. An RC that meets two patterns is
+        # listed once.
         met = {rc.rc: rc for need in needs if need.rc or not need.met for rc in need.rcs if rc.holds}
         in_way = [rc for rc in met.values() if not rc.sharable or (arc.why and rc.rc in arc.why.rcs)]
         holders = [f"{rc.rc}: {'; '.join(hold_text(hold, arc.priority, me) for hold in rc.holds)}" for rc in in_way]
@@ -562,16 +566,23 @@ class Report(LiveLine):
         waited = self._since(arc)
         since = ", ".join(filter(None, (f"waits since {clock(-waited)} ({span(waited)})", ahead, start)))
         self.draw("\n  ".join([words, since, *holders]))
-        # Without the estimate: it changes all the time.
+        # The estimate is no reason for a new line: it changes all the time.
         if self.watched or self._printed == _how(arc):
             return
         before, self._printed = self._printed, _how(arc)
         if before is not None and before[:2] == self._printed[:2]:  # one line for each reason
             words, ahead = f"{arc.name} waits: {ahead or 'nobody ahead'}", ""
         text = "; ".join(filter(None, (words, ahead, start)))
-        stand = [need.as_json() for need in needs]
+        contention = [need.as_json() for need in needs]
         self.event(
-            "waits", text, id=arc.id, reason=arc.reason, why=arc.why, ahead=arc.ahead, starts_in=starts_in, needs=stand
+            "waits",
+            text,
+            id=arc.id,
+            reason=arc.reason,
+            why=arc.why,
+            ahead=arc.ahead,
+            starts_in=starts_in,
+            needs=contention,
         )
 
     def _show_settling(self, arc: OpenArc) -> None:
@@ -602,6 +613,6 @@ def _undecided(arc: OpenArc) -> bool:
 
 
 def held_text(held: OpenArc | Held) -> str:
-    """What is held, and for which pattern: `framegrabber/fgrab1 for framegrabber/*, robot/a`."""
+    """Held devices with the patterns that they meet: `framegrabber/fgrab1 for framegrabber/*, robot/a`."""
     met = {rc: need for need, rc in held.bound.items()}
     return ", ".join(f"{rc} for {met[rc]}" if rc in met else rc for rc in sorted(held.rcs))

@@ -1,5 +1,5 @@
-"""What a request waits for: each need, the devices that meet it, and the requests that hold them, as the leader sees
-them."""
+"""The contention for a request: by need, the devices that meet it and the requests that hold them, from the leader's
+state."""
 
 from __future__ import annotations
 
@@ -22,19 +22,19 @@ HOLDERS_IN_WAY: Final = (ReasonCode.HELD, ReasonCode.VETOED)
 
 @dataclass(frozen=True, slots=True)
 class RcContention:
-    """One device, and the holds of others on it."""
+    """A device, and the holds of other requests on it."""
 
     rc: str
     present: bool
     sharable: bool
     holds: list[HoldView]
     lost: str = ""
-    """Why the device is absent, in words, if that is known."""
+    """The reason that the device is absent, in words; empty: unknown."""
 
 
 @dataclass(slots=True)
 class NeedContention:
-    """One need, and the devices that meet it: the one that it names, or those that match."""
+    """A need, and the devices that meet it: the device named, or all that match the pattern."""
 
     need: str
     rcs: list[RcContention]
@@ -63,14 +63,14 @@ class NeedContention:
         return len(self.free) > self.rivals
 
     def as_json(self) -> dict[str, Any]:
-        """For programs; `rc` is null for a pattern."""
+        """Return the object of `--json`; `rc` is null for a pattern."""
         fields = {name: getattr(self, name) for name in ("need", "rc", "present", "sharable", "free")}
         return fields | {"holders": [hold_json(hold) | {"rc": rc.rc} for rc in self.rcs for hold in rc.holds]}
 
 
 def contention_of(state: RcmState, needs: Collection[str], own: str = "") -> list[NeedContention]:
-    """The contention for each need, without holds of the request `own` (`<host>/<client>/<id>`). A device that one need
-    names does not meet another."""
+    """Return the contention for each need, without holds of the request `own` (`<host>/<client>/<id>`). A device that
+    a need names does not meet a pattern."""
     holds = [hold for hold in state.holds if f"{hold.client}/{hold.id}" != own]
     views = {view.rc: view for view in state.rcs}
 
@@ -85,7 +85,7 @@ def contention_of(state: RcmState, needs: Collection[str], own: str = "") -> lis
     for need in sorted(needs):
         meets = matcher(need)
         matching = sorted(rc for rc in views if rc not in needs and meets(rc)) if is_pattern(need) else [need]
-        # A device that matches a pattern and is absent is left out: any other will do.
+        # Absent devices don't count for a pattern: any other will do.
         rcs = [seen(rc) for rc in matching if not is_pattern(need) or views[rc].present]
         found.append(NeedContention(need, rcs))
     for contention in found:
@@ -96,7 +96,7 @@ def contention_of(state: RcmState, needs: Collection[str], own: str = "") -> lis
 
 
 def whose(view: HoldView | WaitView | ReasonParty) -> str:
-    """The person and the command of a request: `alice@ws1 (survey.py)`."""
+    """Person and command of a request: `alice@ws1 (survey.py)`."""
     command = view.who.command if view.who is not None else ""
     return person(view.who, view.client) + (f" ({clean(command)})" if command else "")
 
@@ -104,8 +104,8 @@ def whose(view: HoldView | WaitView | ReasonParty) -> str:
 def request_words(
     arc: str, who: Who | None, client: str, params: Mapping[str, Decimal] | None = None, me: User | None = None
 ) -> str:
-    """The name of a request and its person: `survey (alice@ws1)`, with the `params` under which it holds a device; for
-    `me`, whose request it is, `your own request survey`."""
+    """Name and person of a request: `survey (alice@ws1)`, with the `params` under which it holds a device; `your own
+    request survey` if it belongs to `me`."""
     name = _own_words(arc) if me is not None and me.owns(client.partition("/")[0], who) else named(who, client, arc)
     return clean(common.with_amounts(name, params or {}))
 
@@ -115,13 +115,13 @@ def _own_words(arc: str) -> str:
 
 
 def comment(who: Who | None) -> str:
-    """What the person wants others to know, as it ends a sentence."""
+    """The request's comment, as the end of a sentence."""
     return f": {clean(who.comment)}" if who is not None and who.comment else ""
 
 
 def reason_text(reason: str, why: ReasonInfo | None, age: float = 0, me: User | None = None) -> str:
-    """Why a request of `me` waits, in words, `age` seconds after the leader sent it: times of day by this host's
-    clock."""
+    """Words for the reason that a request of `me` waits, `age` seconds after the leader sent it. Times of day are by
+    this host's clock."""
     known = reason_of(why)
     if known is None:
         return reason
@@ -138,19 +138,19 @@ def reason_text(reason: str, why: ReasonInfo | None, age: float = 0, me: User | 
 
 
 def hold_text(hold: HoldView, priority: int, me: User | None = None) -> str:
-    """Which request holds it, since when and until when, for `me`, who asks at this priority."""
+    """Describe a hold: its request, begin and end. The end is for a request of `me` at this priority."""
     return hold_words(hold_json(hold), priority, me)
 
 
 def hold_words(hold: Mapping[str, Any], priority: int, me: User | None = None) -> str:
-    """The same of a hold as `hold_json` gives it, with `params` if it has any."""
+    """Like `hold_text`, for a hold as of `hold_json`, with optional `params`."""
     holder = request_words(hold["arc"], hold["who"], hold["client"], hold.get("params"), me)
     since = f"since {clock(-hold['held'])} ({span(hold['held'])})"
     return f"{holder}, priority {hold['priority']}, {since}, {_until(hold, priority)}{comment(hold['who'])}"
 
 
 def _until(hold: Mapping[str, Any], priority: int) -> str:
-    """Until when the hold is protected from a request of this priority, or lasts."""
+    """Words for the end of a hold, or of its protection from a request of this priority."""
     stays, left = hold["keep"] and priority < hold["priority"], hold["remaining"]
     if (waits := hold.get("waits")) is not None:
         return f"{starting(waits)}, then {span(left)}" + (" at least" if stays else "")
@@ -163,7 +163,7 @@ def _until(hold: Mapping[str, Any], priority: int) -> str:
 
 
 def hold_json(hold: HoldView) -> dict[str, Any]:
-    """A hold for programs."""
+    """Return a hold for `--json`."""
     names = ("arc", "id", "client", "who", "priority", "keep", "protected_from")
     fields = {name: getattr(hold, name) for name in names}
     fields["waits"] = None if hold.waits is None else round(hold.waits, 3)
