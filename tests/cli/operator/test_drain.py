@@ -60,7 +60,7 @@ def test_drain_names_the_holder_and_waits_for_its_end(fleet: CliFleet) -> None:
     holder = fleet.holder("furnace", "robot/a", "--min-runtime", "10m", "--", "sleep", "1000")
     drained = fleet.zscout("drain", "anvil", "--comment", "new disk")
     assert (drained.returncode, drained.stdout) == (1, "")
-    words = rf"zscout: anvil is not empty: {re.escape(held_by('furnace'))} holds robot/a until \d\d:\d\d"
+    words = rf"zscout: anvil is not empty: {re.escape(held_by('furnace'))} holds robot/a until \d\d:\d\d at the latest"
     remedy = "wait for holds with --wait, or end them with --now"
     assert re.fullmatch(f"{words}; {remedy}; {STAYS}", drained.stderr), drained.stderr
     # Nobody is granted its devices any more; others' are.
