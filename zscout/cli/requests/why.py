@@ -1,4 +1,4 @@
-"""`zscout why`: the history of a request, and the requests that are in its way."""
+"""`zscout why`: the events of a request (its story), and the requests that are in its way."""
 
 from __future__ import annotations
 
@@ -39,10 +39,10 @@ View = HoldView | WaitView
 @common.json_option("Print one JSON object.")
 @common.runs
 async def why(arc: str, as_json: bool) -> None:
-    """Show the history of a request, and why it waits.
+    """Show the story of a request, event by event, and why it waits.
 
     REQUEST is the request's name, its id, or HOST/CLIENT/ID. For each device that it needs you see the requests that
-    hold it: person, priority, begin and end. The leader keeps the history of an ended request for a while; after that
+    hold it: person, priority, begin and end. The leader keeps the story of an ended request for a while; after that
     the journals of the candidates show its holds and how they ended.
 
     \b
@@ -87,7 +87,7 @@ async def _past_holds(client: Client, arc: str, unknown: common.Failed) -> list[
 
 
 async def _described(client: Client, view: View, state: RcmState) -> dict[str, Any]:
-    """Return an open request for `--json`, with its own history, without other requests of its name. In a hold `need`
+    """Return an open request for `--json`, with its own story, without other requests of its name. In a hold `need`
     is as requested, and `rc` the device that meets it."""
     story = (await common.state_of(client, _full(view))).story
     met = {rc: need for need, rc in view.bound.items()} if isinstance(view, HoldView) else {}
