@@ -1,4 +1,4 @@
-"""What a simulated fleet has for bookings: disks and clocks of hosts, and programs that book, give up and take up."""
+"""Bookings in a simulated fleet: disks and clocks of hosts, and programs that book, give up and take up."""
 
 from __future__ import annotations
 
@@ -35,18 +35,19 @@ from zscout.testing.virtual_time import START
 EPOCH: Final = 1_804_000_000.0
 """Seconds since 1970 at the beginning of a run: four weeks before a change to summer time."""
 SECONDS_OFF, HOURS_OFF, DRIFT = 3.0, (3_600.0, 20_000.0), 0.0005
-"""By how much a host's clock is off: usually, and in some runs; and by which part of the time it drifts, at most."""
+"""Largest offset of a host's clock, its range in some runs (all in seconds), and the largest rate of its drift."""
 SOON, FAR = (1, 12), (8_000, 12_000)
-"""Seconds until the date of a booking: components hold for an hour, and would not begin before one that is nearer."""
+"""Seconds until the date of a booking. Far dates are beyond the hour for which components hold, as nearer dates would
+keep them from starting."""
 TIMES: Final = (1, 2, 2, 3, 40)
-"""How often bookings are repeated: some go on after a month."""
+"""Repetitions of bookings: some continue after a month."""
 QUICK, SLOW = (0.001, 0.02), (0.1, 1.0)
-"""Seconds that a disk takes."""
+"""Seconds for a write to a disk."""
 TIMEOUT: Final = 3.0
-"""Seconds after which a program does not know what became of an operation."""
+"""Seconds after which the outcome of an operation is unknown."""
 WAITS: Final = 25.0
 REFUSED: Final = frozenset({"not_free", "bad_date", "not_kept", "unknown_booking", "unknown_device"})
-"""How operations may be refused that are no nonsense. (A leader that has just begun knows of no RC that is down.)"""
+"""Permitted codes of refused operations. (A new leader does not know RCs that are down.)"""
 NOT_TAKEN: Final = frozenset({"unknown_booking"})
 
 
@@ -56,7 +57,7 @@ def _record(raw: bytes) -> BookingRecord:
 
 
 class MemoryDisk:
-    """What outlives the processes of a host. What was not written to the end when its process died is not there."""
+    """A disk, which outlives the processes of its host. A write that was not complete when its process died is lost."""
 
     def __init__(self, takes: tuple[float, float] = QUICK) -> None:
         self.content: list[bytes] = []
@@ -75,46 +76,46 @@ class MemoryDisk:
 
 
 class Hosts:
-    """Their disks and clocks. `now` is virtual time."""
+    """The disks and clocks of hosts. `now` is virtual time."""
 
     def __init__(self, seed: int, hosts: list[str], now: Callable[[], float], *, booked: bool) -> None:
         rng = random.Random(f"hosts {seed}")  # noqa: S311 - what failed once must fail again
         self._now, self._passed = now, 0.0
         self.disks = {host: MemoryDisk(SLOW if rng.random() < 0.15 else QUICK) for host in hosts}
         self.ahead = {host: rng.uniform(-SECONDS_OFF, SECONDS_OFF) for host in hosts}
-        """By how many seconds the clock of each is ahead."""
+        """Seconds by which each host's clock is ahead."""
         self._drift = {host: rng.uniform(-DRIFT, DRIFT) for host in hosts}
         self._copies: dict[str, list[bytes]] = {}
         if booked and rng.random() < 0.4:
             for host in rng.sample(hosts, rng.choice((1, 1, len(hosts)))):
                 self.ahead[host] = rng.choice((-1, 1)) * rng.uniform(*HOURS_OFF)
         self.kept = {host: rng.random() < 0.5 for host in hosts}
-        """Whether a time service keeps the clock of each, as it says."""
+        """By host: True if it reports that a time service keeps its clock."""
 
     def wall(self, host: str) -> float:
         """The clock of a host, in seconds since 1970."""
         return EPOCH + self._passed + (self._now() - START) * (1 + self._drift[host]) + self.ahead[host]
 
     def pass_by(self, seconds: float) -> None:
-        """So much time has passed in which nothing ran."""
+        """Let time pass on all clocks in which nothing ran."""
         self._passed += seconds
 
     def copy_disks(self) -> None:
         self._copies = {host: disk.content for host, disk in self.disks.items()}
 
     def fail(self, hosts: Iterable[str], *, fails: bool = True) -> None:
-        """Their disks take nothing more, or do again."""
+        """Let writes to the disks of these hosts fail, or succeed again."""
         for host in hosts:
             self.disks[host].failing = fails
 
     def restore_disk(self, host: str) -> None:
-        """What the disk had when it was copied; before, it is a new one."""
+        """Restore the disk from its copy; without a copy, it is empty."""
         self.disks[host].content = self._copies.get(host, [])
 
 
 @dataclass(slots=True)
 class Booker:
-    """A program that has bookings. What it has asked for outlives it."""
+    """A program with bookings. Its operations outlive it."""
 
     name: str
     work: Work
@@ -124,7 +125,7 @@ class Booker:
     lives: dict[str, Life] = field(default_factory=dict)
     """Its bookings, by id."""
     unknown: list[Book | Unbook] = field(default_factory=list)
-    """Operations of which it does not know what became of them."""
+    """Operations with unknown outcomes."""
 
     async def run(self, client: Client, busy: set[str]) -> None:
         rng, bookings = RANDOM.get(), BookingsClient(client, timeout=TIMEOUT)
@@ -184,14 +185,14 @@ class Booker:
     async def _slot(self, bookings: BookingsClient, needs: Any, start: int, runtime: int) -> int | None:
         asked = FindSlots(new_instance(), needs, 0, Decimal(runtime), within=100.0, start=start, limit=2)
         try:
-            told = await bookings.ask(asked, SlotsTold)
+            slots = await bookings.ask(asked, SlotsTold)
         except RcmSilent:
             raise
         except RequestRefused as refused:
             self._refused(refused)
             return None
         self.work.counts["slots looked for"] += 1
-        return told.slots[0].start if told.slots else None
+        return slots.slots[0].start if slots.slots else None
 
     async def _do(
         self,
@@ -210,7 +211,7 @@ class Booker:
         self.work.log(f"{self.name} {operation}")
         asked = self.promises.now()
         try:
-            # If this program dies now, it asks again as it is started anew.
+            # If this program dies now, it asks again after its restart.
             self.unknown.append(operation)
             view = await bookings.ask(operation, BookingView)
         except RequestRefused as refused:

@@ -1,7 +1,7 @@
 """Checks of zscout's promises about bookings under faults (docs/promises.md).
 
 An acknowledgement of an RCM is a fact: a booking was made, or it or one of its dates was given up. Facts survive all
-faults except those that destroy every copy, in the memory of booking keepers and on the hosts' disks."""
+faults except the destruction of every copy, in the memory of booking keepers and on the hosts' disks."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ class Fact:
 
 
 class BookingPromises:
-    """Calls `broken(text)` for each broken promise. `keepers`: those of live processes, by host; `disks`: of all hosts;
+    """Calls `broken(text)` for each broken promise. `keepers`: of live processes, by host; `disks`: of all hosts;
     `wall`: the clock of each host; `calm`: return True without a present fault; `inside`: call a function in the
     process of a host's node."""
 
@@ -448,7 +448,7 @@ class BookingPromises:
                 self._broken(f"{life.book.name} at {start} is lost: it is {states.get(start, 'not listed')}")
 
     def _look_at_conflicts(self, rcm: Rcm, records: Records, views: Mapping[str, BookingView]) -> None:
-        """Check that of two dates that exclude each other the better-ranked stands, for exclusive RCs."""
+        """Check that of two conflicting dates the better-ranked stands, for exclusive RCs."""
         sharable = {rc.name for rc in rcm.core.status().rcs if rc.sharable or not rc.present}
         stands, not_held = list[_Listed](), list[_Listed]()
         for view in views.values():

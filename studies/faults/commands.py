@@ -18,22 +18,22 @@ MAX_FAULT_RUNS: Final = 100_000
 
 
 @click.command()
-@seed_option("0-99", "One run, with its transcript; or those of seeds A to B.", MAX_FAULT_RUNS)
-@click.option("--runs", type=click.IntRange(1, MAX_FAULT_RUNS), help="So many runs, from the first seed on.")
-@click.option("--without", "guard", metavar="GUARD", help="Takes a guard of the protocol out (docs/promises.md).")
+@seed_option("0-99", "A run with its transcript, or a range of seeds A-B.", MAX_FAULT_RUNS)
+@click.option("--runs", type=click.IntRange(1, MAX_FAULT_RUNS), help="Number of runs, from the first seed on.")
+@click.option("--without", "guard", metavar="GUARD", help="Remove a guard of the protocol (docs/promises.md).")
 @click.option("--bookings", is_flag=True, help="Only runs in which programs book; --runs counts these.")
 @jobs_option
 @common.json_option("Print one JSON object instead of tables.")
 def faults(
     seeds: range, runs: int | None, guard: str | None, bookings: bool, processes: int | None, as_json: bool
 ) -> int:
-    """Runs a whole fleet under faults in virtual time, and checks every promise (docs/promises.md).
+    """Run a whole fleet under faults in virtual time, and check every promise (docs/promises.md).
 
-    Candidates, RCs and clients as they are, on a mesh in memory: messages of each kind lost, late, twice;
-    partitions, freezes, crashes, clocks that run apart. Every tenth run is one of 5 minutes with 20 programs,
-    in every tenth nothing fails but nodes, in the steps of a component's move, and in every fifth programs book.
-    One seed is one run, to the byte. Where a promise breaks, `--seed A` leaves out faults until no more can
-    be left out, and prints what happened. Exit code 1: a promise was not kept.
+    The real candidates, RCs and clients, on a mesh in memory: messages of each kind lost, late, or duplicated;
+    partitions, freezes, crashes, drifting clocks. Every tenth run lasts 5 minutes with 20 programs; in every tenth
+    only nodes fail, in the steps of a component's move; in every fifth, programs book. A seed always gives the same
+    run, byte for byte. If a promise breaks, `--seed A` leaves out as many faults as possible and prints the
+    transcript. Exit code 1: a promise was broken.
 
     \b
     Examples:
@@ -53,9 +53,9 @@ def faults(
     else:
         chosen = [seed for seed in seeds if not bookings or len(seeds) == 1 or Size.of(seed).bookers]
     if guard is not None and guard not in GUARDS:
-        raise BadInput(f"--without {quoted(guard)}: there is no such guard; write one of: {', '.join(GUARDS)}")
+        raise BadInput(f"--without {quoted(guard)}: unknown guard; write one of: {', '.join(GUARDS)}")
     if not chosen:
-        raise BadInput("--seed: in none of these runs programs book; write more, or leave out --bookings")
+        raise BadInput("--seed: no program books in these runs; give more seeds, or leave out --bookings")
     if len(chosen) == 1:
         with without(guard):
             result = shrink(simulate(chosen[0]))
@@ -71,12 +71,12 @@ def faults(
 
     found = FaultStudy()
 
-    def take(one: FaultRun) -> None:
-        found.add(one)
-        for text in one.broken[:1]:  # at once: thousands of runs take an hour
-            terminal.print_line(f"seed {one.seed} BROKEN {text}", sys.stderr)
+    def take(result: FaultRun) -> None:
+        found.add(result)
+        for text in result.broken[:1]:  # at once: thousands of runs take an hour
+            terminal.print_line(f"seed {result.seed} BROKEN {text}", sys.stderr)
 
     common.run(run_trials(partial(run, guard=guard), chosen, processes, take))
-    # Not `asdict`: in Python 3.11 it takes counters apart.
+    # Not `asdict`, which fails on counters in Python 3.11.
     show(vars(found), None, partial(print_report, found), as_json=as_json)
     return 1 if found.broken else 0

@@ -1,4 +1,4 @@
-"""Components of a simulated fleet: their own code, each in a process of the simulation instead of the system's."""
+"""Components of a simulated fleet: their real code, each in a simulated process instead of a system process."""
 
 from __future__ import annotations
 
@@ -32,48 +32,48 @@ KINDS: Final = {KIND: "studies.faults.components:Worker"}
 SUPERSEDED_WITHIN: Final = 2.0
 """Seconds without a fault after which no older incarnation acts beside a newer one."""
 NEEDS: Final[tuple[Needs, ...]] = ({"robot/c": {}, "radio/r": {"rate": 2}}, {"radio/r": {"rate": 2}})
-"""Of components: each has one of these."""
+"""The needs of components: each has one of these."""
 LONGER: Final = 3600.0
-"""Seconds, more than any run takes: what they hold is never over by itself."""
+"""Seconds: longer than any run, so that the holds of components never end by time."""
 STEP: Final = 0.1
-"""Seconds from one piece of work to the next."""
+"""Seconds between pieces of work."""
 
 
 class Processes(Protocol):
     """The processes of a simulation."""
 
     def open_process(self, name: str) -> tuple[Process, MemoryMesh]:
-        """Another one, with its place on the mesh."""
+        """Open a process, with its place on the mesh."""
 
     def end_process(self, name: str) -> None:
-        """Nothing of it runs any more."""
+        """Kill the process."""
 
     def watch(self, name: str, client: Client) -> None:
-        """What the client of a process is told is held against the promises."""
+        """Check all news of a process's client against the promises."""
 
 
 @dataclass(slots=True)
 class Deeds:
-    """What components have done, which no fault touches. `broken(text)` is told of a promise that was not kept."""
+    """Record of the components' work, which no fault touches. It calls `broken(text)` for each broken promise."""
 
     broken: Callable[[str], None]
     calm: Callable[[], float]
-    """For how many seconds there was no fault: a host that is cut off knows of no newer incarnation."""
+    """Seconds without a fault: a host that is cut off does not know of newer incarnations."""
     over: Callable[[], bool]
-    """Whether nothing is to be asked for any more."""
+    """Return True when no more requests may be made."""
     busy: dict[str, set[str]]
     """By process: its ARCs that are not over."""
     done: dict[str, dict[Process, int]] = field(default_factory=dict)
-    """By component: how much each of its processes had done, the one that acted last at the end. Of two one may have
-    died before the other began with its number: their placers did not see each other."""
+    """By component: the work done by each of its processes; the process that acted last is at the end. Of two
+    processes with the same number one may have died before the other began: their placers did not see each other."""
 
     def act(self, component: str, process: Process, done: int, restored: int | None) -> None:
-        """`restored`: what it took over of another one, if it was moved."""
+        """`restored`: the work taken over from another process, if it was moved."""
         others = self.done.setdefault(component, {})
         if process not in others:
             if restored is not None and restored not in others.values():
-                known = [(one.name, count) for one, count in others.items()]
-                self.broken(f"{process.name} goes on from {restored}, which no other one had done: {known}")
+                known = [(other.name, count) for other, count in others.items()]
+                self.broken(f"{process.name} continues from {restored}, which no other process had done: {known}")
         elif process is not (last := next(reversed(others))) and self.calm() > SUPERSEDED_WITHIN:
             self.broken(f"{process.name} acts again after {last.name}")
         others.pop(process, None)
@@ -84,14 +84,14 @@ DEEDS: Final[ContextVar[Deeds]] = ContextVar("DEEDS")
 
 
 class Worker(Component):
-    """Does one piece of work after the other, and counts them; holds RCs meanwhile, while nobody else needs them."""
+    """Does pieces of work, and counts them; meanwhile it holds RCs at low priority."""
 
     def __init__(self, params: dict[str, Any]) -> None:
         self.done = 0
         self.restored: int | None = None
         self.arc: OpenArc | None = None
         self.handed = ""
-        """The id of the ARC that its predecessor had, if it had one."""
+        """The id of its predecessor's ARC, if any."""
 
     async def run(self, context: ComponentContext) -> None:
         holding = asyncio.create_task(self._hold(context))
@@ -112,7 +112,7 @@ class Worker(Component):
                 deeds.busy[_here().name] = {"work"}
                 arc = self.arc = await client.request("work", needs, priority=-1, min_runtime=LONGER, keep=False)
                 if self.handed not in ("", arc.id):
-                    deeds.broken(f"{_here().name} asks anew for what was handed to it as {self.handed}")
+                    deeds.broken(f"{_here().name} has a new request instead of {self.handed}, which was handed to it")
                 self.handed = ""
                 while not deeds.over() and (grant := await client.granted(arc)) is not None:
                     while arc.grant == grant and not deeds.over():
@@ -120,12 +120,12 @@ class Worker(Component):
                             with suppress(CommandRefused):
                                 await client.command(rc, grant, {"name": "echo", "value": self.done})
                         await asyncio.sleep(RANDOM.get().uniform(STEP, 1.0))
-                # What is being handed over may come back.
+                # An ARC that is being handed over may come back.
                 if arc.open or client.internals.paused:
                     await client.end(arc)
                 del deeds.busy[_here().name]
         except (RequestRefused, CommandRefused) as refused:
-            deeds.broken(f"what {_here().name} asked for was thrown away: {refused.code}: {refused}")
+            deeds.broken(f"the request of {_here().name} was thrown away: {refused.code}: {refused}")
 
     def checkpoint(self) -> bytes:
         arc = self.arc.id if self.arc is not None and self.arc.open and self.arc._place is not None else ""
@@ -143,7 +143,7 @@ def _here() -> Process:
 
 
 class SimulatedComponent(ComponentProcess):
-    """Its process is one of the simulation; what it and its node say to each other takes no time."""
+    """A component with a simulated process. Messages between it and its node take no time."""
 
     processes: Processes
 
@@ -158,11 +158,11 @@ class SimulatedComponent(ComponentProcess):
         self._child_over = asyncio.Event()
         self._orders = asyncio.Queue()
 
-        def report(one: channel.ComponentReport) -> asyncio.Future[None]:
-            node.run(loop.call_soon, self._on_message, one)
-            told = loop.create_future()
-            told.set_result(None)
-            return told
+        def report(message: channel.ComponentReport) -> asyncio.Future[None]:
+            node.run(loop.call_soon, self._on_message, message)
+            done = loop.create_future()
+            done.set_result(None)
+            return done
 
         async def connect(name: str, *, fleet: Fleet, host: str) -> Client:
             client = Client.on(mesh, fleet)
@@ -199,7 +199,7 @@ class SimulatedComponent(ComponentProcess):
 
 
 async def report_load(mesh: MemoryMesh) -> None:
-    """Publishes the load of an idle host every second: what the balancer must hear of one to choose it."""
+    """Publish the load of an idle host every second, without which the balancer does not choose it."""
     host, rng = mesh.me.host, RANDOM.get()
     token = mesh.alive(Token(host, Role.LOAD, mesh.me.client, new_instance()))
     publisher = mesh.publisher(mesh.keys.load(host), LoadReport)
@@ -211,7 +211,7 @@ async def report_load(mesh: MemoryMesh) -> None:
 
 
 async def operate(mesh: MemoryMesh, work: Work, components: int) -> None:
-    """An operator, who has so many components run, and moves one now and then."""
+    """An operator that starts `components` components, and moves them now and then."""
     rng, placer = RANDOM.get(), PlacerClient(mesh)
     names = [f"w{number}" for number in range(components)]
     spec = ComponentSpec(KIND, restart="always")

@@ -1,6 +1,6 @@
-"""A device as the simulation knows it, which no fault touches: it sees who drives it, and what it is told to do.
+"""A simulated device, which no fault touches: it knows its drivers, holders and commands.
 
-The promises about a device are checked here, where they count, and not by what services believe."""
+The promises about a device are checked here, at the device, and not by the beliefs of services."""
 
 from __future__ import annotations
 
@@ -20,43 +20,43 @@ NO_GRANT: Final = Grant(NO_TERM, 0)
 
 @dataclass(slots=True)
 class Device:
-    """One device; `broken(text)` is told of a promise that was not kept."""
+    """A device. It calls `broken(text)` for each broken promise."""
 
     name: str
     capacity: Mapping[str, Fraction] | None
-    """None: it is exclusive."""
+    """None if it is exclusive."""
     broken: Callable[[str], None]
     log: Callable[[str], None]
     holders: dict[Grant, tuple[Process, Holder]] = field(default_factory=dict)
-    """Who drives it, and in which process the driver is that let them."""
+    """Its holders, each with the process of the driver that admitted it."""
     programs: dict[Grant, str] = field(default_factory=dict)
-    """Programs that touch it past its driver, by grant: whose they are."""
+    """Clients of the programs that use it past its driver, by grant."""
     now: Callable[[], float] = lambda: 0.0
-    """Virtual time, of which no process has a clock."""
+    """Virtual time, which no process can read."""
     starts: float = 0.0
     """Seconds from the beginning of a hold until it is ready."""
     ready: dict[Grant, float] = field(default_factory=dict)
-    """By grant: from when on its holder could use it, in virtual time."""
+    """By grant: when it became usable for its holder, in virtual time."""
     done: set[str] = field(default_factory=set)
     """The commands of programs that it has carried out."""
     newest: tuple[Process, Grant] | None = None
-    """Of all commands that it has carried out; and the process that its driver was in. One that starts anew knows of
-    none, and obeys the RCM that it finds."""
+    """The newest grant of its commands, and the process of the driver. A restarted driver knows no grants, and obeys
+    the RCM that it finds."""
 
     def begin(self, process: Process, holder: Holder) -> None:
         self.log(f"{self.name} begins for {holder.client} {holder.arc} {number(holder.grant)}")
         self._forget_dead()
-        # The same ARC, in another client: it was handed over.
+        # The same ARC in another client was handed over.
         arc = holder.id, holder.place
         self.holders = {grant: held for grant, held in self.holders.items() if (held[1].id, held[1].place) != arc}
         if self.capacity is None and self.holders:
-            other = next(one for _, one in self.holders.values())
+            other = next(current for _, current in self.holders.values())
             self.broken(f"two holders of {self.name}: {other.client} and {holder.client}")
         self._is_alone(holder.grant, holder.client)
         self.holders[holder.grant] = process, holder
         if self.capacity is not None:
             for parameter, most in self.capacity.items():
-                total = sum(exact_amounts(one.params).get(parameter, Fraction()) for _, one in self.holders.values())
+                total = sum(exact_amounts(held.params).get(parameter, Fraction()) for _, held in self.holders.values())
                 if total > most:
                     self.broken(f"{self.name} carries {float(total):g} of {parameter}, and can carry {float(most):g}")
 
@@ -65,12 +65,12 @@ class Device:
         self.holders.pop(holder.grant, None)
 
     def safe(self, process: Process) -> None:
-        """All that this driver let in have gone."""
+        """All holders that this driver admitted are gone."""
         self.log(f"{self.name} is safe")
         self.holders = {grant: held for grant, held in self.holders.items() if held[0] is not process}
 
     def command(self, process: Process, holder: Holder, value: object) -> None:
-        """A program gives each of its commands a value of its own; a component may command the same again."""
+        """Commands of programs have unique strings as values; components may repeat values."""
         if isinstance(value, str):
             if value in self.done:
                 self.broken(f"{self.name} carries out a command of {holder.client} twice")
@@ -80,18 +80,18 @@ class Device:
         if self.capacity is None and holder.grant < newest:
             self.broken(f"{self.name} obeyed {number(holder.grant)} after {number(newest)}")
         if holder.grant not in self.holders:
-            self.broken(f"{self.name} obeyed {holder.client}, who does not hold it")
+            self.broken(f"{self.name} obeyed {holder.client}, which does not hold it")
         if holder.grant >= newest:
             self.newest = process, holder.grant
 
     def touch(self, grant: Grant, client: str) -> None:
-        """A program begins to touch it past its driver."""
+        """A program begins to use the device past its driver."""
         self.log(f"{self.name} is touched by a program of {client} {number(grant)}")
         self._is_alone(grant, client)
         self.programs[grant] = client
 
     def leave(self, grant: Grant) -> None:
-        """Such a program is gone."""
+        """A program that used the device past its driver is gone."""
         if self.programs.pop(grant, None) is not None:
             self.log(f"{self.name} is left by a program {number(grant)}")
 
@@ -99,10 +99,10 @@ class Device:
         if self.capacity is None:
             for other, of in self.programs.items():
                 if other != grant:
-                    self.broken(f"two programs at {self.name}: that of {of} {number(other)}, and {client}'s")
+                    self.broken(f"two programs at {self.name}: one of {of} {number(other)}, and one of {client}")
 
     def _forget_dead(self) -> None:
-        # What a driver let in that was killed drives nothing any more: commands went through it.
+        # Holders that a killed driver admitted no longer drive: their commands went through it.
         self.holders = {grant: held for grant, held in self.holders.items() if not held[0].dead}
         if self.newest is not None and self.newest[0].dead:
             self.newest = None
@@ -113,7 +113,7 @@ def number(grant: Grant) -> str:
 
 
 class _Watched:
-    """A driver's part that tells its device."""
+    """The part of a driver that reports to its device."""
 
     device: Device
 

@@ -113,4 +113,4 @@ def believed(rcm: Rcm) -> str:
         of_forger += request.client == FORGER
     if of_forger > rcm.fleet.limits.max_requests_per_client:
         return f"{FORGER} has {of_forger} requests open"
-    return "a booking is kept that only a node tells of" if rcm.bookings.record("forged") is not None else ""
+    return "a booking is kept that only a node claims" if rcm.bookings.record("forged") is not None else ""

@@ -1,6 +1,6 @@
-"""The guards of the protocol, each of which can be taken out of a simulated fleet: without it some promise must break.
+"""The guards of the protocol. Each can be removed from a simulated fleet; without it, some promise must break.
 
-What is taken out is one decision in one function, so that the rest of the fleet is as it is."""
+Removing a guard changes a single decision, usually in one function, and leaves the rest of the fleet as it is."""
 
 from __future__ import annotations
 
@@ -58,9 +58,9 @@ ABSENT: Final = object()
 
 class Guard(NamedTuple):
     what: str
-    """What it demands."""
+    """The rule that it enforces."""
     without: Mapping[tuple[Any, str], Any]
-    """By class or module and name: what stands there instead. (`all` of a module hides the one of Python.)"""
+    """Replacements by class or module and name. (`all` of a module hides Python's.)"""
 
 
 def _nothing(*_: object, **__: object) -> None:
@@ -75,11 +75,11 @@ def _no(*_: object, **__: object) -> bool:
     return False
 
 
-def _as_told(_self: Admission, request: ArcRequest) -> ArcRequest:
+def _as_listed(_self: Admission, request: ArcRequest) -> ArcRequest:
     return request
 
 
-def _as_it_says(_self: Authority, _sender: Sender, who: Who | None) -> Who | None:
+def _as_claimed(_self: Authority, _sender: Sender, who: Who | None) -> Who | None:
     return who
 
 
@@ -195,21 +195,21 @@ def _undated(_self: BookedDates, request: ArcRequest) -> ArcRequest:
     return request
 
 
-def _newer(one: BookingRecord, other: BookingRecord) -> BookingRecord:
-    return max(one, other, key=lambda record: record.changed)
+def _newer(mine: BookingRecord, other: BookingRecord) -> BookingRecord:
+    return max(mine, other, key=lambda record: record.changed)
 
 
-def _unbooked_by_newer(one: BookingRecord, other: BookingRecord) -> BookingRecord:
-    return replace(_merged(one, other), unbooked=_newer(one, other).unbooked)
+def _unbooked_by_newer(mine: BookingRecord, other: BookingRecord) -> BookingRecord:
+    return replace(_merged(mine, other), unbooked=_newer(mine, other).unbooked)
 
 
-def _dates_of_newer(one: BookingRecord, other: BookingRecord) -> BookingRecord:
-    newer = _newer(one, other)
-    return replace(_merged(one, other), dropped=newer.dropped, over=newer.over)
+def _dates_of_newer(mine: BookingRecord, other: BookingRecord) -> BookingRecord:
+    newer = _newer(mine, other)
+    return replace(_merged(mine, other), dropped=newer.dropped, over=newer.over)
 
 
-def _believed(one: BookingRecord, _other: BookingRecord) -> BookingRecord:
-    return one
+def _believed(mine: BookingRecord, _other: BookingRecord) -> BookingRecord:
+    return mine
 
 
 def _hear_any(self: BookingKeeper, grants: Any) -> None:
@@ -256,37 +256,41 @@ def _at_its_end(held: Mapping[str, Holder], now: Ns) -> Ns:
 
 GUARDS: Final[Mapping[str, Guard]] = MappingProxyType(
     {
-        "promise": Guard("an RC that answered a new leader obeys no older one", {(HoldTable, "promise"): _promise}),
-        "order": Guard("an RC obeys nothing older than what it heard", {(HoldTable, "_accept"): _accept}),
+        "promise": Guard("an RC that answered a new leader obeys no older leader", {(HoldTable, "promise"): _promise}),
+        "order": Guard("an RC obeys nothing older than it has received", {(HoldTable, "_accept"): _accept}),
         "grant": Guard("a command is obeyed under exactly the grant that is held", {(HoldTable, "check"): _check_any}),
-        "ended": Guard("a grant that ended at an RC does not begin again", {(HoldTable, "_remove"): _forget_ended}),
+        "ended": Guard(
+            "a grant that ended at an RC does not begin again there", {(HoldTable, "_remove"): _forget_ended}
+        ),
         "safe first": Guard(
             "the device is safe before its next holder begins",
             {(ResourceController, "_carry_out_change"): _begin_first},
         ),
         "missed": Guard(
-            "an RC that missed a publication reads the state, and a leader sets right what it reports otherwise",
+            "an RC that missed a publication reads the state, and a leader corrects a report that differs",
             {(HoldTable, "apply_grants"): _miss_nothing, (Leader, "_compare"): _nothing},
         ),
         "hold lease": Guard(
             "without an RCM for the hold lease a hold ends",
             {(HoldTable, "expire"): _expire_by_time, (RcmLink, "watch_lease"): _never},
         ),
-        "snapshots": Guard("what a snapshot adds passes the RC's own vote", {(ResourceController, "_carries"): _yes}),
+        "snapshots": Guard("additions of a snapshot pass the RC's own vote", {(ResourceController, "_carries"): _yes}),
         "once": Guard("a command that arrives again is not carried out again", {(CommandMemory, "is_new"): _yes}),
         "denied": Guard(
-            "of two holds of an ARC that are reported, its client's word counts",
+            "of two reported holds of an ARC, the one that its client lists counts",
             {
                 (Operations, "_denied"): _nothing,
                 (RequestLog, "_is_of_another"): _nothing,
                 (Roster, "_is_disputed"): _nothing,
             },
         ),
-        "door": Guard("what clients list passes the door of what they ask for", {(Admission, "check"): _nothing}),
-        "clamped": Guard("what RCs report is no more than its client may ask for", {(Admission, "clamped"): _as_told}),
-        "certified": Guard("who asks has the name of its certificate", {(Authority, "certified_who"): _as_it_says}),
+        "door": Guard(
+            "requests that clients list pass the same admission as new requests", {(Admission, "check"): _nothing}
+        ),
+        "clamped": Guard("a reported hold is clamped to its client's rights", {(Admission, "clamped"): _as_listed}),
+        "certified": Guard("a sender has the name of its certificate", {(Authority, "certified_who"): _as_claimed}),
         "managers": Guard("records of bookings come from managers only", {(Authority, "may_lead"): _yes}),
-        "sealed": Guard("a place is had by whom it was given to", {(Places, "may_claim"): _yes}),
+        "sealed": Guard("only the client that was given a place has it", {(Places, "may_claim"): _yes}),
         "instances": Guard(
             "of two instances of an RC one serves", {(Instances, "begin"): _nothing, (Roster, "named"): _no_names}
         ),
@@ -296,26 +300,28 @@ GUARDS: Final[Mapping[str, Guard]] = MappingProxyType(
             {(recovery, "gangs_of"): _alone, (roster, "gangs_of"): _alone},
         ),
         "majority": Guard("a candidate that RCs contradict waits", {(Election, "must_wait"): _no}),
-        "deposed": Guard("who was deposed waits longer each time", {(Election, "deposed"): _nothing}),
+        "deposed": Guard("a deposed candidate waits longer each time", {(Election, "deposed"): _nothing}),
         "step down": Guard("a leader that sees a higher term steps down", {(Candidate, "_weigh"): _believe}),
-        "away": Guard("a leader that was away itself drops nobody for it", {(Roster, "_was_away"): _no}),
-        "reopen": Guard("who was dropped and lives goes on at its place", {(RequestLog, "reopens"): _no}),
+        "away": Guard("a leader that was away itself drops no client for it", {(Roster, "_was_away"): _no}),
+        "reopen": Guard("a dropped client that lives resumes at its place", {(RequestLog, "reopens"): _no}),
         "places": Guard("a client shows the place that it had", {(OpenArc, "_as_asked"): _without_place}),
         "claims": Guard("of the ARCs that claim one place one runs", {(SchedulerState, "_is_first"): _yes}),
         "unheard": Guard(
-            "a request whose time passed unnoticed is submitted again",
+            "a hold that had its time before its client knew is requested again",
             {(RequestStore, "_submit_under_new_id"): _nothing},
         ),
         "notices": Guard("of two notices the newer counts", {(OpenArc, "_take"): _take_any}),
-        "terms": Guard("a client believes nothing of an older term", {(RcmLink, "accept"): _accept_any}),
+        "terms": Guard(
+            "a client believes nothing of an older term, except where it may go back",
+            {(RcmLink, "accept"): _accept_any},
+        ),
         "absurd": Guard(
-            "nobody believes a term far above the fleet's",
+            "no process believes a term far above the fleet's",
             {(holds, "absurd"): _no, (rcm_link, "absurd"): _no, (candidate, "absurd"): _no, (terms, "absurd"): _no},
         ),
-        "words": Guard("with certificates a client's word moves no term", {(Terms, "counts"): _yes}),
+        "words": Guard("with `[security]` a client's word moves no term", {(Terms, "counts"): _yes}),
         "doubted": Guard(
-            "a host whose RCs alone show a term in which nobody leads is believed once",
-            {(Terms, "_doubted"): _never_ns},
+            "a host whose RCs alone show a term without a leader is believed once", {(Terms, "_doubted"): _never_ns}
         ),
         "sealed terms": Guard("a leader goes above the term of a sealed place", {(Places, "proves"): _no}),
         "back": Guard(
@@ -324,44 +330,48 @@ GUARDS: Final[Mapping[str, Guard]] = MappingProxyType(
         ),
         "kept": Guard("managers keep their highest term on disk", {(KeptTerm, "keep"): _do_nothing}),
         "handed": Guard(
-            "what was handed over stays the old client's until the new one has heard of it",
+            "a handed-over hold stays the old client's until the new client knows of it",
             {(MovableClient, "_awaited_by"): _none_async},
         ),
         "ids": Guard("a request that has ended is not entered again", {(RequestLog, "ended"): _no}),
-        "links": Guard("a session in contradiction is opened anew", {(Suspicions, "suspect"): _nothing}),
+        "links": Guard("a session in contradiction is reopened", {(Suspicions, "suspect"): _nothing}),
         "believed": Guard(
-            "who believes in a hold is not told to wait before its RCs could say so", {(RequestLog, "may_be_held"): _no}
+            "a client that believes in a hold is not sent back to the queue before its RCs could answer",
+            {(RequestLog, "may_be_held"): _no},
         ),
-        "beside": Guard("what its RCs do not confirm ends the body", {(Confirmations, "_give_back"): _nothing}),
+        "beside": Guard("a hold that its RCs do not confirm ends the body", {(Confirmations, "_give_back"): _nothing}),
         "settling": Guard("an RC settles before the next holder begins", {(HoldTable, "settles"): _nothing}),
         "confirmed": Guard("an RC settles from the last confirmation on", {(HoldTable, "confirmed"): _confirmed_once}),
         "deadline": Guard("a program is gone by its deadline", {(DirectHold, "gone_by"): _no_deadline}),
         "remembered": Guard(
-            "an RC that starts anew settles where it may have been held directly",
+            "an RC that restarts settles where its last holder may be direct",
             {(HoldTable, "settle_at_start"): _nothing},
         ),
         "unbooked": Guard("a booking that was given up stays so", {(records, "merged"): _unbooked_by_newer}),
         "dates": Guard("a date that was given up, or is over, stays so", {(records, "merged"): _dates_of_newer}),
-        "merged": Guard("what a host has is one source among all", {(records, "merged"): _believed}),
+        "merged": Guard("a host's records are one source among all", {(records, "merged"): _believed}),
         "copied": Guard("a booking is acknowledged when another host has it", {(BookingSharing, "keep"): _keep_later}),
         "caught up": Guard(
-            "who comes later is told all", {(BookingSharing, "_on_token"): _nothing, (BookingSharing, "_behind"): NEVER}
+            "a keeper that joins later receives all records",
+            {(BookingSharing, "_on_token"): _nothing, (BookingSharing, "_behind"): NEVER},
         ),
         "late": Guard("a late publication turns no clock back", {(BookingKeeper, "hear"): _hear_any}),
-        "fleet time": Guard("a leader goes on in the time of the fleet", {(bookings, "_time"): _own_wall}),
+        "fleet time": Guard("a leader continues the fleet's time", {(bookings, "_time"): _own_wall}),
         "steady": Guard("fleet time moves only where most clocks differ from it", {(FleetClock, "correct"): _follow}),
         "dates first": Guard(
             "a leader knows of all dates before it grants",
             {(Bookings, "recovered"): _none_recovered, (Rcm, "enter"): _do_nothing},
         ),
-        "one stands": Guard("of two bookings that can't both be one stands", {(Calendar, "_obstacle"): _no_obstacle}),
-        "awaited": Guard("who has taken up a date does not begin before it", {(BookedDates, "dated"): _undated}),
-        "had again": Guard("who has taken up a date has it again once it can be", {(Calendar, "_offer"): _nothing}),
+        "one stands": Guard(
+            "of two bookings that exclude each other one stands", {(Calendar, "_obstacle"): _no_obstacle}
+        ),
+        "awaited": Guard("an ARC with a date does not begin before it", {(BookedDates, "dated"): _undated}),
+        "had again": Guard("an ARC with a lost date gets it again once possible", {(Calendar, "_offer"): _nothing}),
         "budget": Guard(
-            "who has spent its budget is preempted by operators only", {(Arc, "protected_below"): _nothing}
+            "an ARC that has spent its budget is preempted by operators only", {(Arc, "protected_below"): _nothing}
         ),
         "protected": Guard(
-            "who is protected stays so under the next leader", {(recovery, "_protected_from"): _at_its_end}
+            "a protected hold stays protected under the next leader", {(recovery, "_protected_from"): _at_its_end}
         ),
         "begun": Guard("a hold's time begins when its devices have begun", {(leader, "beginnings"): _none_recovered}),
         "begun heard": Guard(
@@ -370,7 +380,7 @@ GUARDS: Final[Mapping[str, Guard]] = MappingProxyType(
         "tolerated": Guard("a device that is unwell keeps its holder", {(Tolerance, "lost_at"): _lost_at_once}),
         "unwell": Guard("operators alone are granted an unwell device", {(SchedulerState, "open_to"): _all_present}),
         "withdrawn": Guard(
-            "what nobody asks for is given back",
+            "a hold that no client asks for is given back",
             {(RcmLink, "give_back"): _do_nothing, (Roster, "ask_requests"): _no_change},
         ),
     }
@@ -379,7 +389,7 @@ GUARDS: Final[Mapping[str, Guard]] = MappingProxyType(
 
 @contextmanager
 def without(name: str | None) -> Iterator[None]:
-    """Takes a guard out, in this process."""
+    """Remove a guard in this process."""
     put_back: list[tuple[Any, str, Any]] = []
     try:
         for (owner, attribute), instead in GUARDS[name].without.items() if name is not None else ():

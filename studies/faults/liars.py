@@ -49,7 +49,7 @@ async def _as_client(mesh: Mesh, term: Callable[[], Term]) -> None:
 
 
 async def _as_rc(mesh: Mesh, term: Callable[[], Term]) -> None:
-    """Obeys terms in which nobody leads."""
+    """Obeys terms without a leader."""
     instance, host, honest = new_instance(), mesh.me.host, RANDOM.get().random() < 0.5
 
     def state(promise: Term | None = None) -> RcState:
@@ -65,12 +65,12 @@ async def _as_rc(mesh: Mesh, term: Callable[[], Term]) -> None:
 
 
 async def _as_candidate(mesh: Mesh, term: Callable[[], Term]) -> None:
-    """Has RCs, clients or both promise, and is not heard of again."""
+    """Asks RCs, clients or both for promises, and then disappears."""
     ask, keys = RcAsk(promise=term(), ordinary=True), mesh.keys
     rcs = mesh.ask(keys.rc_state_any, ask, RcState, timeout=LIED_EVERY)
     clients = mesh.ask(keys.requests_any, ask, ClientRequests, timeout=LIED_EVERY)
     asked = RANDOM.get().choice(((rcs,), (clients,), (rcs, clients)))
-    for one in {rcs, clients} - {*asked}:
-        one.close()
+    for answers in {rcs, clients} - {*asked}:
+        answers.close()
     await asyncio.gather(*asked)
     await asyncio.Event().wait()

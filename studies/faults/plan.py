@@ -1,4 +1,4 @@
-"""What goes wrong in a run, and when: drawn from the seed before the run begins, so that a fault can be left out."""
+"""The faults of a run and their times, drawn from the seed before the run begins, so that faults can be left out."""
 
 from __future__ import annotations
 
@@ -47,80 +47,80 @@ KINDS: Mapping[FaultKind, int] = MappingProxyType(
         "forge": 1,
     }
 )
-"""And how often each is drawn."""
+"""Weights of the kinds in draws."""
 DELAYS: Final = frozenset({"freeze", "stall", "cut", "isolate", "part", "disturb", "forget"})
-"""Those by which messages are late, or heard late."""
+"""Kinds of faults that delay messages or their processing."""
 LASTING, SHARES = ((0.5, 1.5), (0.05, 3.0), (3.0, 8.0)), (7, 2, 1)
-"""Seconds, and how often: about a lease is the worst there is; longer than the hold lease is seldom."""
+"""Ranges of seconds and their weights. Durations of about a lease are the worst; few exceed the hold lease."""
 JUMPS = (3, 10_000_000, MAX_COUNTER)
-"""How far a forged term is above the fleet's: it is believed; it is absurd; it is the last there is, at most."""
+"""Distances of a forged term above the fleet's: believed, absurd, and up to the highest possible term."""
 LONGER = 1.0
-"""Seconds for which hosts are apart besides, at most: so that both sides have a leader."""
+"""Largest addition in seconds to the time for which hosts are apart, so that both sides have a leader."""
 HALVES = (4.0, 12.0)
-"""The same where programs book: both book for some time."""
+"""Seconds for which halves are apart in runs with bookings: both halves book."""
 OUT = (1.0, 8.0)
-"""Seconds for which a host is out that comes back with an old disk, or all are that are started anew."""
+"""Seconds for which a host is down before it returns with an old disk, or all hosts before they restart."""
 MONTH: Final = 30 * 86_400
 STEP: Final = 7_200
-"""Seconds by which a host's clock is set at once, at most."""
+"""Largest jump of a host's clock in seconds."""
 STEPS: Final = (6, 20, STEP, 3 * 86_400)
-"""The same where those of several hosts are set: dates are skipped, or come again."""
+"""Largest jumps of several hosts' clocks: dates are skipped, or come again."""
 HEALED = 45.0
 RELINK = 1.0
-"""Seconds after which links that were lost stand again, at most."""
+"""Seconds after which lost links are restored at the latest."""
 MESSAGES = ("grants", "rc/state", "rcm/state", "schedule", "notice", "requests", "command", "confirm", "vote", "alive")
 """Kinds of messages that may be disturbed."""
 OPERATIONS = ("hand_over", "move", "restore", "activate")
-"""Steps of a component's move: the first node that asks for one of them, or answers, may be killed as it does, and
-nobody but the other hears what it has just said."""
+"""Steps of a component's move. The first node that requests such a step, or answers, may be killed just then, so that
+its message reaches only the other node."""
 UNTIL_ASKED = 5
-"""How many times longer than others a kill waits for one of them."""
+"""Factor by which a kill waits longer for such a step than for other messages."""
 
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """From `at` on, for `lasts` seconds."""
+    """A fault at `at`, for `lasts` seconds."""
 
     at: float
     lasts: float
     kind: FaultKind
     whom: tuple[str, ...]
-    """Processes or hosts; of a partition one side of it; of a cut from whom and to whom; of a kill one or
-    the first of several to say something; an RC, and a host."""
+    """Processes or hosts. Of a partition: one side. Of a cut: source and target. Of a kill: a process, or several, of
+    which the first to send `message` is killed. Of a double: an RC and a host."""
     both: bool = True
     """Of a cut: in both directions. Of a double: it leaves in order. Of a kill: at once, not at the next `message`."""
     message: str = ""
-    """A kind of messages, or of a kill an operation."""
+    """A kind of messages, or for a kill an operation."""
     how: Disturbance = field(default_factory=Disturbance)
     jump: int = 0
-    """Of a forged term; in seconds, of a clock that is set, or for how long nothing ran by the clocks of hosts."""
+    """Of a forged term; or of a clock in seconds; or the seconds that pass on all hosts while everything is down."""
 
     @property
     def felt(self) -> float:
-        """Seconds for which it goes on when it is over: until links stand again, or every process that it left in
-        contradiction has joined anew."""
+        """Seconds for which its effects last after its end: until links are restored, or until every process in a
+        contradiction has reopened its session."""
         tokens_lost = self.kind == "disturb" and self.message == "alive" and self.how.lost > 0
         return HEALED if self.kind == "forget" or tokens_lost else RELINK
 
     def __str__(self) -> str:
         what = {
-            "freeze": "stands still",
-            "stall": "does not come round to anything",
-            "kill": "is killed, and started again" if self.both else f"killed, the first that sends: {self.message}",
-            "cut": "cut from one another" if self.both else "the first can't reach the second",
+            "freeze": "is frozen",
+            "stall": "processes nothing",
+            "kill": "is killed, and restarted" if self.both else f"killed, the first that sends: {self.message}",
+            "cut": "cut from each other" if self.both else "the first can't reach the second",
             "isolate": "is cut off",
             "part": "are cut off from all others",
             "disturb": f"disturbed: {self.message} {self.how}",
             "double": "offers it as well",
             "fail": "fails, and works again",
-            "forge": f"has a stranger that says to lead in a term {self.jump} higher",
-            "forget": "is cut off, and its links come back without all that was declared",
-            "old disk": "is out, and comes back with what its disk had early in the run",
-            "restart": f"everything is out, and started anew {self.jump / 86_400:g} days later",
+            "forge": f"has a stranger that claims to lead in a term {self.jump} higher",
+            "forget": "is cut off, and its links return without some declarations",
+            "old disk": "is down, and returns with an early copy of its disk",
+            "restart": f"everything is down, and restarted {self.jump / 86_400:g} days later",
             "disk": "can't write to its disk",
             "clock": f"have their clocks set by {self.jump} s",
             "lie": f"has a liar ({self.message}), of terms {self.jump} higher",
-            "nodes": f"all but clients is killed, and started again{' with empty disks' if self.jump else ''}",
+            "nodes": f"all but clients are killed, and restarted{' with empty disks' if self.jump else ''}",
         }[self.kind]
         return f"{self.at:7.3f} for {self.lasts:.3f} s: {' '.join(self.whom)} {what}"
 
@@ -128,9 +128,9 @@ class Fault:
 def draw(
     seed: int, processes: Sequence[str], hosts: Sequence[str], rcs: Sequence[str], *, count: int, span: float
 ) -> list[Fault]:
-    """`count` faults within `span` seconds, most of them 0.5 to 1.5 s long: about a lease, the worst there is."""
-    rng = random.Random(f"faults {seed}")  # noqa: S311 - what failed once must fail again
-    # One of its own: a seed that has no such fault is what it was before there were any.
+    """`count` faults within `span` seconds, most of them 0.5 to 1.5 s long: about a lease, which is the worst."""
+    rng = random.Random(f"faults {seed}")  # noqa: S311 - failures must be repeatable
+    # A separate generator: seeds without such faults give the same runs as before these faults were added.
     steps = random.Random(f"operations {seed}")  # noqa: S311
     nodes = _nodes(processes)
     faults = []
@@ -141,7 +141,7 @@ def draw(
         apart = lasts + LONGER * rng.random()
         match kind:
             case "freeze" | "stall" | "kill":
-                # One of them leads, and that is felt most.
+                # Prefer nodes: one of them leads, and its faults have the most effects.
                 whom = (rng.choice(nodes if rng.random() < 0.5 else processes),)
             case "cut":
                 whom = tuple(rng.sample(hosts, 2))
@@ -176,18 +176,20 @@ def draw(
 
 
 def draw_moves(seed: int, processes: Sequence[str], *, count: int, span: float) -> list[Fault]:
-    """Nothing but nodes that are killed in the steps of a component's move."""
+    """Only kills of nodes in the steps of a component's move."""
     rng = random.Random(f"moves {seed}")  # noqa: S311
     nodes = _nodes(processes)
     return sorted((_at_a_step(rng, nodes, *_when(rng, span)) for _ in range(count)), key=lambda fault: fault.at)
 
 
 def draw_for_bookings(seed: int, hosts: Sequence[str], span: float, drawn: Sequence[Fault]) -> list[Fault]:
-    """The faults that were `drawn`, and what endangers bookings most: halves that both go on for some time, and what
-    becomes of disks and clocks."""
+    """The `drawn` faults, and those most dangerous for bookings: halves that both run for some time, and faults of
+    disks and clocks."""
     rng = random.Random(f"bookings {seed}")  # noqa: S311
-    # An answer on this key may be of any booking, and says nothing of what was asked.
-    faults = [replace(one, how=replace(one.how, old=0.0)) if one.message == "schedule" else one for one in drawn]
+    # No old answers on this key: they don't name their question, so they may concern any booking.
+    faults = [
+        replace(fault, how=replace(fault.how, old=0.0)) if fault.message == "schedule" else fault for fault in drawn
+    ]
 
     def add(kind: FaultKind, whom: Sequence[str], lasts: float, jump: int = 0, after: float = 3.0) -> None:
         faults.append(Fault(rng.uniform(after, span), lasts, kind, tuple(sorted(whom)), jump=jump))
@@ -209,8 +211,8 @@ def draw_for_bookings(seed: int, hosts: Sequence[str], span: float, drawn: Seque
 
 
 def draw_lies(seed: int, hosts: Sequence[str], span: float, drawn: Sequence[Fault]) -> list[Fault]:
-    """The faults that were `drawn`, with lies of members in place of a stranger's forgeries, and all nodes that are
-    killed while clients live."""
+    """The `drawn` faults with lies of members instead of a stranger's forgeries, and sometimes the killing of all nodes
+    while clients live."""
     rng = random.Random(f"lies {seed}")  # noqa: S311
     faults = [fault for fault in drawn if fault.kind != "forge"]
     for kind in ("client", "rc", *rng.choices(LIES, k=2)):
@@ -228,7 +230,7 @@ def _nodes(processes: Sequence[str]) -> tuple[str, ...]:
 
 
 def _when(rng: random.Random, span: float) -> tuple[float, float]:
-    """When it begins, and for how long it lasts."""
+    """A fault's beginning and duration."""
     at = 3.0 + rng.random() * (span - 3.0)
     return at, rng.uniform(*rng.choices(LASTING, SHARES)[0])
 

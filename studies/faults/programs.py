@@ -1,4 +1,4 @@
-"""What the programs of a simulated fleet do: they ask for devices, at random, and command what they hold."""
+"""The programs of a simulated fleet: they request random devices, and command the devices that they hold."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ from zscout.types import SECOND, Place
 LONG: Final = 4
 STEALS_EVERY: Final = 0.5
 CLEARS_UP: Final = (0.0, 0.0, 0.2, 1.0, 60.0)
-"""Seconds that a program takes to end when it is told to; the last is killed before."""
+"""Seconds that a program takes to end on request; with the last, it is killed before."""
 
 
 class Program:
-    """A program that touches devices past their RCs, with a guardian that keeps its deadline. It is a process of its
-    own, which neither stands still nor dies with its client."""
+    """A program that uses devices past their RCs, and its guardian, which keeps the deadline. It is a process of its
+    own, and neither stops nor dies with its client."""
 
     def __init__(self, devices: Mapping[str, Device], direct: DirectHold, client: str, now: Callable[[], int]) -> None:
         self._devices = [devices[rc] for rc in direct.rcs]
@@ -41,15 +41,15 @@ class Program:
         self.keep(direct)
 
     def keep(self, direct: DirectHold) -> None:
-        """Its guardian is given the deadline anew."""
+        """Give the guardian a new deadline."""
         if self._timer is not None:
             self._timer.cancel()
         left = max(0.0, (direct.gone_by - self._now()) / SECOND)
-        # The guardian is no part of the client's process, and its clock is its own.
+        # The guardian is not part of the client's process, and has its own clock.
         self._timer = Context().run(asyncio.get_running_loop().call_later, left, self.end)
 
     def end(self) -> None:
-        """Nothing of it is left."""
+        """End the program: it leaves all devices."""
         if self._timer is not None:
             self._timer.cancel()
         for device in self._devices:
@@ -57,24 +57,26 @@ class Program:
 
 
 async def steal_places(mesh: Mesh, over: Callable[[], bool]) -> None:
-    """Asks at the places of others that wait, and says to new leaders that they are its own. Leaves when it is over."""
+    """Request at the places of others that wait, and claim these places to new leaders, until the run is `over`."""
     rng, listed, seals = RANDOM.get(), list[OpenRequest](), dict[Place | None, str | None]()
-    hear = lambda _, notice: seals.update({notice.place: notice.seal})  # noqa: E731
+    collect = lambda _, notice: seals.update({notice.place: notice.seal})  # noqa: E731
     answer = lambda query: query.answer(ClientRequests(str(mesh.me), listed))  # noqa: E731
     declared = [
-        mesh.subscribe(mesh.keys.notice_any, Notice, hear),
+        mesh.subscribe(mesh.keys.notice_any, Notice, collect),
         mesh.serve(mesh.keys.requests(mesh.me), RcAsk, answer),
         mesh.alive(Token(mesh.me.host, Role.CLIENT, mesh.me.client, new_instance())),
     ]
     while not over():
         await asyncio.sleep(rng.uniform(0, 2 * STEALS_EVERY))
         state = await mesh.ask_one(mesh.keys.ask_state(mesh.me), StateAsk(), RcmState, timeout=STEALS_EVERY)
-        others = [one for one in state.message.queue if one.client != str(mesh.me)] if state and state.message else []
+        others = (
+            [wait for wait in state.message.queue if wait.client != str(mesh.me)] if state and state.message else []
+        )
         if others:
-            one = rng.choice(others)
-            id_ = rng.choice((new_instance(), one.id))
-            stolen = OpenRequest(id_, "stolen", one.needs, one.priority, one.min_runtime, seal=seals.get(one.place))
-            listed[:] = [replace(stolen, place=one.place, was=rng.choice((None, one.id)))]
+            wait = rng.choice(others)
+            id_ = rng.choice((new_instance(), wait.id))
+            stolen = OpenRequest(id_, "stolen", wait.needs, wait.priority, wait.min_runtime, seal=seals.get(wait.place))
+            listed[:] = [replace(stolen, place=wait.place, was=rng.choice((None, wait.id)))]
             ask = carried(listed[0], Ask)
             await mesh.ask_one(mesh.keys.schedule(mesh.me), ask, Notice, timeout=STEALS_EVERY)
     for left in declared:
@@ -84,27 +86,27 @@ async def steal_places(mesh: Mesh, over: Callable[[], bool]) -> None:
 
 @dataclass(slots=True)
 class Work:
-    """What all programs have to do: to ask for `devices` until `over`, with up to `pause` seconds in between."""
+    """The work of all programs: to request `devices` until `over`, with up to `pause` seconds in between."""
 
     devices: Mapping[str, Mapping[str, object] | None]
-    """By RC: its capacity, where it is sharable."""
+    """By RC: its capacity; None if it is exclusive."""
     pause: float
     counts: Counter[str]
     log: Callable[[str], None]
     broken: Callable[[str], None]
     touched: Mapping[str, Device] | None = None
-    """By RC: its device, where programs touch it past the RC."""
+    """By RC: its device, if programs use devices past their RCs."""
     over: bool = False
     commanded: int = 0
 
     async def run(self, client: Client, arc: str, busy: set[str]) -> None:
-        """One ARC after the other, under one name, which is in `busy` while one is open."""
+        """Request ARCs one after the other, all named `arc`. The name is in `busy` while an ARC is open."""
         rng = RANDOM.get()
         await asyncio.sleep(rng.uniform(0, 3))
         while not self.over:
             rcs = rng.sample(sorted(self.devices), rng.choice((1, 1, 2, 2, 3)))
             needs = {rc: {"rate": rng.choice((2, 4, 6))} if self.devices[rc] else {} for rc in rcs}
-            # Some go on through any fault, and its end.
+            # Some last longer than any fault.
             times = LONG if rng.random() < 0.15 else 1
             how: dict[str, Any] = {
                 "priority": rng.choice((0, 0, 0, 1, 5)),
@@ -141,10 +143,10 @@ class Work:
         try:
             await self._body(held, times)
         finally:
-            # One that is killed sees to nothing: its guardian does.
+            # A killed client ends nothing: the guardian does.
             if process is not None and not process.dead:
                 try:
-                    # What ends of its own accord has nobody to wait for it.
+                    # A program that ends by itself takes no time to end.
                     await asyncio.sleep(RANDOM.get().choice(CLEARS_UP) if direct.over else 0)
                 finally:
                     if not process.dead:

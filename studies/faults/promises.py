@@ -67,7 +67,7 @@ class Promises:
         self.unheard = False
         """True if no publication of an RCM arrives, or no token of a new RCM. Then a term begins every few seconds."""
         self._begun: list[float] = []
-        """When terms began, without those that began while `unheard`."""
+        """When terms began, except while `unheard`."""
         self._newest: dict[str, tuple[Term, int]] = {}
         """By ARC: (term, step) of the newest notice to its client."""
         self._arc_of: dict[str, str] = {}

@@ -1,4 +1,4 @@
-"""Many runs under faults, what they come to, and what is left of the faults of one that failed."""
+"""Many runs under faults, their summary, and the reduction of a failed run to few faults."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from studies.faults.simulation import Result, Size, simulate
 from zscout import terminal
 
 SHRINK_WITHIN = 200
-"""Runs at most in which faults are left out."""
+"""Most runs in which faults are left out."""
 
 
 @dataclass(slots=True)
 class FaultRun:
-    """What one run comes to, without its transcript."""
+    """The result of a run, without its transcript."""
 
     seed: int
     broken: list[str]
@@ -28,13 +28,13 @@ class FaultRun:
     span: float
     """Seconds of virtual time with faults."""
     served_after: float
-    """Seconds of virtual time from the end of the last fault until all that was asked for was served."""
+    """Seconds of virtual time from the end of the last fault until all requests were served."""
     took: float
     """Seconds of a processor."""
 
 
 def run(seed: int, guard: str | None = None) -> FaultRun:
-    """One run, without this guard of the protocol if one is named."""
+    """Run a seed, without this `guard` of the protocol if given."""
     began = time.process_time()
     with without(guard):
         result = simulate(seed)
@@ -44,7 +44,7 @@ def run(seed: int, guard: str | None = None) -> FaultRun:
 
 
 def shrink(result: Result) -> Result:
-    """The run with the fewest faults in which the same promise breaks, by leaving out one after the other."""
+    """Leave out faults one by one while the same promise breaks, and return the last such run."""
     if not result.broken:
         return result
     wanted, tries, at = promise(result.broken[0]), 0, 0
@@ -59,7 +59,7 @@ def shrink(result: Result) -> Result:
 
 
 def promise(broken: str) -> str:
-    """What was not kept, without the names and numbers of this time."""
+    """The broken promise, without the names and numbers of this run."""
     _, _, text = broken.partition(" ")
     return re.sub(r"\b[hc]\d+\S*|[\d.]+", "*", text)[:80]
 
@@ -77,17 +77,17 @@ class FaultStudy:
     faults: Counter[str] = field(default_factory=Counter)
     served_after: list[float] = field(default_factory=list)
     broken: dict[str, list[int]] = field(default_factory=dict)
-    """By promise: the seeds of the runs in which it was not kept first."""
+    """By promise: the seeds of the runs in which it was the first broken promise."""
 
-    def add(self, one: FaultRun) -> None:
+    def add(self, run: FaultRun) -> None:
         self.runs += 1
-        self.seconds += one.span
-        self.took += one.took
-        self.counts += one.counts
-        self.faults += one.faults
-        self.served_after.append(one.served_after)
-        if one.broken:
-            self.broken.setdefault(promise(one.broken[0]), []).append(one.seed)
+        self.seconds += run.span
+        self.took += run.took
+        self.counts += run.counts
+        self.faults += run.faults
+        self.served_after.append(run.served_after)
+        if run.broken:
+            self.broken.setdefault(promise(run.broken[0]), []).append(run.seed)
 
 
 def print_report(study: FaultStudy) -> None:
@@ -96,8 +96,8 @@ def print_report(study: FaultStudy) -> None:
         f"{terminal.many(study.runs, 'run')}, {hours:.1f} h of virtual time with faults,"
         f" {study.took / study.runs:.2f} s of a processor each"
     )
-    for what, counted in (("faults", study.faults), ("what happened", study.counts)):
-        terminal.print_table([what, "how often"], [[name, f"{number:,}"] for name, number in sorted(counted.items())])
+    for what, counted in (("faults", study.faults), ("events", study.counts)):
+        terminal.print_table([what, "number"], [[name, f"{number:,}"] for name, number in sorted(counted.items())])
     served = sorted(study.served_after)
     terminal.print_line(
         f"all served after the last fault: median {statistics.median(served):.2f} s, worst {served[-1]:.2f} s"

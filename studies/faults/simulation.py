@@ -1,7 +1,7 @@
-"""A fleet under faults, in virtual time: the services and clients as they are, each process on a mesh in memory.
+"""A fleet under faults in virtual time: the real services and clients, each process on a mesh in memory.
 
-One seed is one run, to the byte: the work, the faults, the network's delays, and every process's clock and randomness
-come from it. Afterwards all faults are mended, and what was asked must be served."""
+A seed always gives the same run, byte for byte: the work, the faults, the network's delays, and the clock and
+randomness of every process. At the end all faults are over, and all requests must be served."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ T = TypeVar("T")
 
 
 class TermMemory:
-    """The highest term, on a disk that outlives processes."""
+    """A disk with the highest term, which outlives processes."""
 
     term: Term = NO_TERM
 
@@ -77,24 +77,24 @@ DEVICES: Final[Mapping[str, Mapping[str, Fraction] | None]] = {
 }
 EXCLUSIVE: Final = tuple(rc for rc, capacity in DEVICES.items() if capacity is None)
 REBOOTS: Final = 8.0
-"""Seconds for which a device does not work, at most, in runs where some don't."""
+"""Longest outage of a device in seconds, in runs with unwell devices."""
 TOLERATED: Final = 60 * SECOND
-"""For how long RCs tolerate that."""
-HEARD: Final = 1.0
-"""Seconds without any fault after which a leader knows that a device is unwell, and what it granted before has come."""
+"""The outage that RCs tolerate."""
+REPORTED_WITHIN: Final = 1.0
+"""Seconds without any fault after which a leader knows that a device is unwell, and earlier grants have arrived."""
 SLOW: Final[Mapping[str, float]] = {"robot/a": 4.0, "framegrabber/f": 1.0}
-"""Seconds that some devices need to start, in runs that have slow ones."""
+"""Seconds that some devices need to start, in runs with slow devices."""
 DRIFT: Final = 0.001
-"""By which clocks run apart at most."""
+"""Largest difference between the rates of two clocks."""
 SERVED_WITHIN: Final = 60.0
-"""Seconds after the last fault in which all that was asked must have been served."""
+"""Seconds after the last fault within which all requests must be served."""
 FORGOTTEN: Final = 0.3
-"""Of what was declared, where links come back without all of it."""
+"""Share of declarations that are lost when links return incompletely."""
 SETTLE: Final = 2.0
 """Seconds that RCs settle."""
 SETTLED_WITHIN: Final = 60.0
-"""Seconds after all was served in which all keepers know the same bookings: all are asked every 30 s, and one that is
-not for 40 s joins the mesh anew."""
+"""Seconds after the last service within which all keepers know the same bookings. Keepers are asked every 30 s; a
+keeper without a query for 40 s reopens its session."""
 COPIED_AT: Final = 10.0
 """Seconds after the beginning at which disks are copied."""
 LOOK_EVERY: Final = 0.05
@@ -106,40 +106,39 @@ PLACES_KEY: Final = bytes(32)
 
 @dataclass(frozen=True, slots=True)
 class Size:
-    """How much happens in a run."""
+    """The size and kind of a run."""
 
     hosts: int = 3
-    """With a candidate each. Half of the runs have one more, without."""
+    """Hosts with a candidate. Half of the runs have another host without a candidate."""
     clients: int = 4
     components: int = 2
     faults: int = 6
     span: float = 30.0
     """Seconds with faults and new requests."""
     pause: float = 3.0
-    """Seconds from one request of a program to its next, at most."""
+    """Longest time in seconds from a request of a program to its next."""
     direct: bool = False
-    """Many programs touch devices past their RCs."""
+    """Many programs use devices past their RCs."""
     thief: bool = False
-    """Managers share a key, and a program asks at the places of others. Commands arrive twice."""
+    """Managers share a key, and a program requests at the places of others. Commands arrive twice."""
     moves_only: bool = False
-    """Nothing fails but nodes, in the steps of a component's move: no other fault excuses what breaks."""
+    """Only nodes fail, in the steps of a component's move: no other fault excuses a broken promise."""
     liars: bool = False
-    """Certificates are there, and members lie about terms."""
+    """The fleet has certificates, and members lie about terms."""
     bookers: int = 0
     """Programs that book, give up and take up."""
     slow: bool = False
     """Two devices need time to start for a holder."""
     unwell: bool = False
-    """Devices do not work now and then, for a while."""
+    """Devices fail temporarily now and then."""
     forger: bool = False
-    """Names are proven, and one that has a certificate lists, reports and keeps what is not so."""
+    """The fleet has certificates, and a member lists, reports and keeps forgeries."""
 
     @classmethod
     def of(cls, seed: int) -> Size:
-        """Every tenth run is a long one of many, every tenth one of moves that fail, every tenth one of programs that
-        touch devices past their RCs, every tenth one with a thief, one with liars, every fifth one of bookings, every
-        twentieth one with a forger, every fortieth one of devices that start slowly, every eightieth
-        one of devices that do not work now and then."""
+        """Every tenth run each is long with many clients, or has failing moves, or programs that use devices past their
+        RCs, or a thief, or liars. Every fifth run has bookings, every twentieth a forger, every fortieth slow devices,
+        every eightieth unwell devices."""
         match seed % 10:
             case 3 | 4:
                 return cls(bookers=2, clients=3, faults=4, span=40.0)
@@ -167,21 +166,21 @@ class Result:
     seed: int
     faults: list[Fault]
     broken: list[str] = field(default_factory=list)
-    """Promises that were not kept, each with the time."""
+    """Broken promises, each with the time."""
     lines: list[str] = field(default_factory=list)
     trace: list[str] = field(default_factory=list)
-    """What became of holds, in the order in which it came about (`zscout.trace`)."""
+    """The events of holds in order (`zscout.trace`)."""
     digest: str = ""
-    """Of everything that arrived anywhere, in order."""
+    """Of all messages that arrived, in order."""
     counts: Counter[str] = field(default_factory=Counter)
     served_after: float = 0.0
-    """Seconds from the end of the last fault until all was served."""
+    """Seconds from the end of the last fault until all requests were served."""
 
 
 def simulate(
     seed: int, size: Size | None = None, faults: Sequence[Fault] | None = None, *, traced: bool = False
 ) -> Result:
-    """One run. `faults` in place of those that the seed draws; `traced`: with the trace of what became of holds."""
+    """Simulate a run. `faults` replaces the faults drawn by the seed; `traced`: keep the trace of holds."""
     fleet = Simulation(seed, size or Size.of(seed), faults, traced=traced)
     logger, handler = logging.getLogger("zscout"), _Lines(fleet)
     before = logger.level, logger.propagate
@@ -190,7 +189,7 @@ def simulate(
     trace.log.setLevel(logging.DEBUG)
     logger.propagate = False
     collecting = gc.isenabled()
-    gc.disable()  # what dies is to die at its place in the run
+    gc.disable()  # collected objects could otherwise act at random points of the run
     try:
         with asyncio.Runner(loop_factory=VirtualTimeLoop) as runner:
             runner.get_loop().set_exception_handler(fleet.on_exception)
@@ -206,7 +205,7 @@ def simulate(
 class Simulation:
     def __init__(self, seed: int, size: Size, faults: Sequence[Fault] | None, *, traced: bool = False) -> None:
         self.seed, self.size, self._traced = seed, size, traced
-        self.random = random.Random(f"fleet {seed}")  # noqa: S311 - what failed once must fail again
+        self.random = random.Random(f"fleet {seed}")  # noqa: S311 - failures must be repeatable
         self.hosts = [f"h{number}" for number in range(size.hosts + (self.random.random() < 0.5))]
         self.candidates_at = self.hosts[: size.hosts]
         self.clients = {f"{self.random.choice(self.hosts)}/c{number}": None for number in range(size.clients)}
@@ -217,7 +216,7 @@ class Simulation:
         if size.forger:
             self.fleet = forgers.closed(replace(self.fleet, strategy="adaptive"), self.hosts, self.candidates_at)
         self.where = {rc: f"{self.random.choice(self.hosts)}/{self._program(rc)}" for rc in DEVICES}
-        """In which process each RC is: in its host's node, or in one of its own, without a candidate beside it."""
+        """The process of each RC: its host's node, or a process of its own without a candidate."""
         bookers = [f"{self.random.choice(self.hosts)}/b{number}" for number in range(size.bookers)]
         self.clients |= dict.fromkeys(bookers)
         self.running: dict[str, tuple[Process, MemoryMesh]] = {}
@@ -225,13 +224,13 @@ class Simulation:
         self.excused: set[str] = set()
         """Clients that need not be served at the end."""
         self.keepers: dict[str, BookingKeeper] = {}
-        """By host: those of processes that live."""
+        """The keepers of live processes, by host."""
         self.rcs: dict[str, ResourceController] = {}
         self.programs: dict[str, Client] = {}
         self.busy: dict[str, set[str]] = {}
         """By program: its ARCs that are not over."""
         self.present: list[Fault] = []
-        """The faults of now."""
+        """The present faults."""
         self.calm_since = START
         """When the last fault ended."""
         self.everybody = [
@@ -249,16 +248,16 @@ class Simulation:
         if size.bookers:
             drawn = plan.draw_for_bookings(seed, self.hosts, size.span, drawn)
         if size.direct:
-            # A second instance has a device of its own, which no program of the first touches.
+            # A second instance has its own device, which no program of the first instance uses.
             drawn = [fault for fault in drawn if fault.kind != "double"]
         self.last_holders = {rc: LastHolder() for rc in DEVICES}
-        """What RCs keep on disk."""
+        """The last holders that RCs keep on disk."""
         self.faults = drawn if faults is None else list(faults)
         self.cuts: Counter[tuple[str, str]] = Counter()
         self.result = Result(seed, self.faults)
         self.idle, self.failed = asyncio.Event(), asyncio.Event()
         self._had: dict[str, set[tuple[str, Place]]] = {}
-        """By instance of an RC: the ARCs that held it at the last look."""
+        """By instance of an RC: its holding ARCs at the last look."""
 
     def _program(self, rc: str) -> str:
         return "node" if self.random.random() < 0.6 else f"rc-{rc.replace('/', '-')}"
@@ -295,7 +294,7 @@ class Simulation:
             where=self.where,
             faults=self.faults,
             fleet=self.fleet,
-            leading=lambda: {host: one.rcm.term for host, one in self.candidates.items() if one.rcm is not None},
+            leading=lambda: {host: at.rcm.term for host, at in self.candidates.items() if at.rcm is not None},
             terms=self.promises.terms,
             now=lambda: loop.now,
         )
@@ -340,8 +339,8 @@ class Simulation:
         return self.result
 
     def _goes_round_dates(self) -> set[str]:
-        """Clients whose ARCs would run into what is booked: the dates of days to come may be near after a month."""
-        leaders = [one.rcm for one in self.candidates.values() if one.rcm is not None]
+        """Clients with ARCs that wait because of bookings: after a month, later dates may be near."""
+        leaders = [candidate.rcm for candidate in self.candidates.values() if candidate.rcm is not None]
         return {
             arc.request.client
             for rcm in leaders
@@ -350,12 +349,12 @@ class Simulation:
         }
 
     async def _served(self) -> None:
-        """All faults are mended, and then all that was asked for is served."""
+        """Wait until all faults are over and all requests are served, and check the end."""
         await asyncio.sleep(self.size.span)
         self.work.over = True
         end = max([self.size.span, *(fault.at + fault.lasts for fault in self.faults)])
         await asyncio.sleep(max(0.0, START + end - self.loop.now))
-        self.log("all faults are mended")
+        self.log("all faults are over")
         mended = self.loop.now
         try:
             async with asyncio.timeout(SERVED_WITHIN):
@@ -376,10 +375,10 @@ class Simulation:
         self.result.counts["terms"] += len(self.promises.terms)
 
     async def _bookings_settled(self) -> None:
-        """All who keep bookings know the same, and that is what was acknowledged."""
+        """Wait until all keepers know the same bookings, and check them against the acknowledgements."""
         try:
             async with asyncio.timeout(SETTLED_WITHIN):
-                while self.booked.unsettled(self._leading_hosts()):  # noqa: ASYNC110 - nobody tells it
+                while self.booked.unsettled(self._leading_hosts()):  # noqa: ASYNC110 - there is no event for it
                     await asyncio.sleep(LOOK_EVERY)
         except TimeoutError:
             why = self.booked.unsettled(self._leading_hosts())
@@ -388,7 +387,7 @@ class Simulation:
         restarted = any(fault.kind == "restart" for fault in self.faults)
         self.result.counts += self.booked.at_end(self._leading_hosts(), jumped=restarted)
 
-    # What is seen
+    # Observation
 
     def log(self, text: str) -> None:
         process = PROCESS.get()
@@ -396,7 +395,7 @@ class Simulation:
         self.result.lines.append(f"{self.loop.now - START:8.3f}  {who:8}  {text}")
 
     def broken(self, text: str) -> None:
-        """A promise was not kept."""
+        """A promise was broken."""
         process = PROCESS.get()
         if process is not None and process.dead:
             return
@@ -405,7 +404,7 @@ class Simulation:
         self.failed.set()
 
     def on_exception(self, _loop: object, context: dict[str, Any]) -> None:
-        self.broken(f"an error that nobody saw: {context.get('exception') or context['message']!r}")
+        self.broken(f"an unhandled error: {context.get('exception') or context['message']!r}")
 
     def _trace(self, source: str, target: str, kind: str, args: tuple[Any, ...]) -> None:
         self.result.counts["messages"] += 1
@@ -430,12 +429,12 @@ class Simulation:
                 name: self.running[name][0].run(client.mesh.now) - client.internals.rcm._last_contact
                 for name, client in clients.items()
             }
-            # Two instances of an RC on one mesh are settled while there are two.
+            # With two instances of an RC on one mesh, the fleet counts as calm.
             calm = all(fault.kind == "double" for fault in self.present)
             lasting = dict(self.booked.look(self._leading_hosts(), calm=not self.present)) if self.bookers else {}
             self.promises.look(clients, self.rcs, self._leaders(), silence, calm=calm, lasting=lasting)
             if self.size.unwell:
-                self._look_who_gets_unwell_devices()
+                self._check_unwell_devices()
             if self.size.forger:
                 for why in filter(None, map(forgers.believed, self._leaders().values())):
                     self.broken(f"a leader believes a forger: {why}")
@@ -446,12 +445,12 @@ class Simulation:
                 self.idle.set()
 
     def _alive(self, of: dict[str, T]) -> dict[str, T]:
-        """Without those that stand still."""
-        return {name: one for name, one in of.items() if not self.running[name][0].stopped}
+        """The items whose processes are not stopped."""
+        return {name: item for name, item in of.items() if not self.running[name][0].stopped}
 
     def _leaders(self) -> dict[str, Rcm]:
-        candidates = {f"{host}/node": one for host, one in self.candidates.items()}
-        return {name: one.rcm for name, one in self._alive(candidates).items() if one.rcm is not None}
+        candidates = {f"{host}/node": candidate for host, candidate in self.candidates.items()}
+        return {name: at.rcm for name, at in self._alive(candidates).items() if at.rcm is not None}
 
     def _leading_hosts(self) -> dict[str, Rcm]:
         return {name.split("/")[0]: rcm for name, rcm in self._leaders().items()}
@@ -480,14 +479,14 @@ class Simulation:
         return self.running[name]
 
     def end_process(self, name: str, reached: MemoryTransport | None = None) -> None:
-        """Nothing of it runs any more, and of what it has just said nothing arrives but at `reached`, or some."""
+        """Kill the process. Of its last messages only those to `reached` arrive, or by default a random part."""
         process, mesh = self.running.get(name, (None, None))
         self.busy.pop(name, None)
         if process is not None and mesh is not None and not process.dead:
-            # In this order: nothing that would clean up says anything.
+            # In this order, so that clean-up code can't send messages.
             self.network.kill(mesh, reached)
             process.kill()
-        if "." in name:  # a component's: no other that lives has its name
+        if "." in name:  # a component's process, whose name is not used again
             self.running.pop(name, None)
 
     def _start(self, process: Process, name: str, mesh: MemoryMesh) -> None:
@@ -532,7 +531,7 @@ class Simulation:
             candidate.start()
         elif self.size.bookers and str(mesh.me) in self.where.values():
             self.keepers[host] = keeper
-            keeper.start(Supervisor("what keeps bookings", self._on_failure))
+            keeper.start(Supervisor("the keeper of bookings", self._on_failure))
         component_host = ComponentHost(
             mesh, self.fleet, ComponentsConfig(), self._on_failure, kinds=lambda: KINDS, process=self.component
         )
@@ -565,7 +564,7 @@ class Simulation:
             await self._offer(rc, self.devices[rc], mesh, stall, confirmations)
 
     async def _spare(self, name: str, mesh: MemoryMesh, leaves: asyncio.Event) -> None:
-        """Another device of this name on another host, until it `leaves`."""
+        """Offer another device of this name on another host, until `leaves` is set."""
         rc = await self._offer(name, self._device(name), mesh, StallWatch(mesh.now).start())
         await leaves.wait()
         await rc.stop()
@@ -578,7 +577,7 @@ class Simulation:
         return max((term.counter for term in self.promises.terms), default=0)
 
     async def _forge(self, mesh: MemoryMesh, jump: int) -> None:
-        """Publishes as an RCM, of which nobody sees a token."""
+        """Publish as an RCM without a token."""
         term = Term(min(self._highest() + jump, MAX_COUNTER), new_instance())
         while True:
             mesh.put(mesh.keys.grants, Grants(term, 1, 1, FORGED_EVERY, {}, []))
@@ -597,8 +596,8 @@ class Simulation:
     def _instances(self, name: str) -> dict[str, ResourceController]:
         return {key: rc for key, rc in self.rcs.items() if rc.name == name}
 
-    def _look_who_gets_unwell_devices(self) -> None:
-        """Only operators, and holds that go on from another."""
+    def _check_unwell_devices(self) -> None:
+        """Check that unwell devices begin only for operators, and for holds that continue others."""
         had, self._had = (
             self._had,
             {
@@ -610,12 +609,12 @@ class Simulation:
         for key, rc in self.rcs.items():
             process, _ = self.running[key.split()[0]]
             unwell_for = process.run(lambda rc: rc.unwell_for, rc)
-            if key not in had or process.stopped or min(unwell_for, calm) < HEARD:
+            if key not in had or process.stopped or min(unwell_for, calm) < REPORTED_WITHIN:
                 continue
             for entry in rc.holds.held.values():
                 holder = entry.holder
-                goes_on = (holder.id, holder.place) in had[key] or holder.continues
-                if not goes_on and holder.priority < self.fleet.operator_priority:
+                continued = (holder.id, holder.place) in had[key] or holder.continues
+                if not continued and holder.priority < self.fleet.operator_priority:
                     self.broken(f"{rc.name} begins for {holder.client} {holder.arc}, and is unwell")
 
     def _on_failure(self, error: Exception) -> None:
@@ -630,17 +629,17 @@ class Simulation:
         if name in self.bookers:
             await self.bookers[name].run(client, busy)
             await client.close()
-            # What it gave up where nobody led is told by its token.
+            # Requests that it gave up without a leader end with its token.
             del self.programs[name]
             return
         await asyncio.gather(*(self.work.run(client, f"{mesh.me.client}-{number}", busy) for number in range(2)))
 
     def watch(self, name: str, client: Client) -> None:
-        """Whatever this client is told is held against the promises."""
+        """Check all news of this client against the promises."""
         began: dict[str, tuple[Grant | None, float, list[str]]] = {}
-        """By ARC: its last grant, since when it was known here, and of which RCs it was."""
+        """By ARC: its last grant, when it became known here, and its RCs."""
 
-        def told(arc: OpenArc) -> None:
+        def on_news(arc: OpenArc) -> None:
             self.log(f"{arc.name} {arc.state} {arc.outcome or ''} {arc.reason}")
             self.booked.news(arc, self._leading_hosts())
             grant, since, rcs = began.get(arc.id, (None, 0.0, []))
@@ -655,7 +654,7 @@ class Simulation:
             if arc.grant is not None and arc.grant != grant:
                 began[arc.id] = arc.grant, self.loop.now - START, arc.rcs
 
-        client.internals.watch(told)
+        client.internals.watch(on_news)
 
     # Faults
 
@@ -743,7 +742,7 @@ class Simulation:
                 with self.booked.destroying():
                     for name in names:
                         self._take_down(name)
-                DEEDS.get().done.clear()  # nothing goes on from what was done before
+                DEEDS.get().done.clear()  # no component continues from earlier work
                 self.equipment.pass_by(fault.jump)
                 end = partial(self._start_all, names)
             case "disk":
@@ -754,11 +753,11 @@ class Simulation:
                     self.equipment.ahead[host] += fault.jump
                 end = lambda: None  # noqa: E731
         self.present.append(fault)
-        self._look_who_is_heard()
+        self._note_delays()
         self.loop.call_later(fault.lasts, self._end, fault, end)
 
     def _each(self, rcs: Mapping[str, ResourceController], call: Callable[[ResourceController], None]) -> None:
-        """Has the processes of these RCs do something when they go on, as far as they live."""
+        """Call a function in the live processes of these RCs, when they run again."""
         for key, rc in rcs.items():
             process, _ = self.running[key.split()[0]]
             if self.rcs.get(key) is rc and not process.dead:
@@ -772,10 +771,10 @@ class Simulation:
 
     def _forget_fault(self, fault: Fault) -> None:
         self.present.remove(fault)
-        self._look_who_is_heard()
+        self._note_delays()
         self.calm_since = self.loop.now
 
-    def _look_who_is_heard(self) -> None:
+    def _note_delays(self) -> None:
         lost = {fault.message for fault in self.present if fault.kind == "disturb" and fault.how.lost == 1}
         self.promises.unheard = not lost.isdisjoint(("grants", "alive"))
         if any(fault.kind in plan.DELAYS for fault in self.present):
@@ -816,10 +815,10 @@ class Simulation:
 
     def _pairs(self, fault: Fault) -> list[tuple[str, str]]:
         if fault.kind == "cut":
-            one, other = fault.whom
-            return [(one, other), (other, one)] if fault.both else [(one, other)]
+            source, target = fault.whom
+            return [(source, target), (target, source)] if fault.both else [(source, target)]
         side = set(fault.whom)
-        return [(one, other) for one in self.hosts for other in self.hosts if (one in side) != (other in side)]
+        return [(host, other) for host in self.hosts for other in self.hosts if (host in side) != (other in side)]
 
     def _mend(self, pairs: list[tuple[str, str]]) -> None:
         self.cuts.subtract(pairs)
@@ -832,11 +831,11 @@ class Simulation:
 
     def _cut(self) -> None:
         cuts = +self.cuts
-        self.network.cut_where(lambda one, other: (one.split("/")[0], other.split("/")[0]) in cuts)
+        self.network.cut_where(lambda source, target: (source.split("/")[0], target.split("/")[0]) in cuts)
 
 
 class _Lines(logging.Handler):
-    """What services log becomes part of the transcript; an error among it is a promise that was not kept."""
+    """Adds the logs of services to the transcript. A logged error is a broken promise."""
 
     def __init__(self, fleet: Simulation) -> None:
         super().__init__()

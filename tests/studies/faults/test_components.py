@@ -23,7 +23,9 @@ def test_an_older_process_does_not_act_again_after_a_newer_one() -> None:
     assert broken == ["h0/w.1001 acts again after h1/w.1002"]
 
 
-@pytest.mark.parametrize(("restored", "text"), [(2, ""), (3, "h2/w.3001 goes on from 3, which no other one had done")])
+@pytest.mark.parametrize(
+    ("restored", "text"), [(2, ""), (3, "h2/w.3001 continues from 3, which no other process had done")]
+)
 def test_one_that_died_does_not_act_where_another_has_its_number(restored: int, text: str) -> None:
     """Placers that did not see each other may have given a number twice, on one host: seed 1923."""
     seen, broken = deeds()

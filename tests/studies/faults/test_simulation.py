@@ -173,4 +173,4 @@ def test_only_runs_of_bookings_are_counted_where_those_are_wanted() -> None:
     assert (done.returncode, done.stderr) == (0, "")
     done = study("5-7", "--bookings")
     assert (done.returncode, done.stderr.count("\n")) == (2, 1)
-    assert "in none of these runs programs book" in done.stderr
+    assert "no program books in these runs" in done.stderr
