@@ -240,11 +240,11 @@ class BookingPromises:
                 if arc is not None and booking.start <= now and self._has_no_excuse(rcm, name, booking, arc, now):
                     yield (name, "is taken up, and its date has come, but", arc, "does not run"), AT_ITS_DATE
         for host, keeper in self._keepers.items():
-            if (term := keeper.heard[0]) not in self._times and keeper.time is not None:
+            if (term := keeper.received[0]) not in self._times and keeper.time is not None:
                 self._overheard.setdefault(
                     term, self._inside(host, partial(_FleetTime.received_by, keeper, self.now()))
                 )
-        self._heard = {host: keeper.heard[0] for host, keeper in self._keepers.items() if keeper.time is not None}
+        self._heard = {host: keeper.received[0] for host, keeper in self._keepers.items() if keeper.time is not None}
         self._records = {host: known for host, known in (self._records | self._news).items() if host in self._keepers}
         self._news = {}
 

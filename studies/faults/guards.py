@@ -355,7 +355,7 @@ GUARDS: Final[Mapping[str, Guard]] = MappingProxyType(
             "a keeper that joins later receives all records",
             {(BookingSharing, "_on_token"): _nothing, (BookingSharing, "_behind"): NEVER},
         ),
-        "late": Guard("a late publication turns no clock back", {(BookingKeeper, "hear"): _hear_any}),
+        "late": Guard("a late publication turns no clock back", {(BookingKeeper, "observe"): _hear_any}),
         "fleet time": Guard("a leader continues the fleet's time", {(bookings, "_time"): _own_wall}),
         "steady": Guard("fleet time moves only where most clocks differ from it", {(FleetClock, "correct"): _follow}),
         "dates first": Guard(

@@ -33,7 +33,7 @@ async def test_a_publication_that_comes_late_turns_no_clock_back() -> None:
         gone = asyncio.get_running_loop().time() - begun
         true = NOON + ahead + gone
         held = max(0.0, age + gone - late)
-        keeper.hear(Grants(Term(term, "x"), 1, 1, 0.5, {}, [], time=true - late, time_age=held))
+        keeper.observe(Grants(Term(term, "x"), 1, 1, 0.5, {}, [], time=true - late, time_age=held))
         assert keeper.time is not None
         return true - keeper.time / SECOND
 

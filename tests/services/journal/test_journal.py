@@ -258,7 +258,7 @@ async def test_no_rcm_heard_is_a_gap_that_lasts(tmp_path: Path) -> None:
     mesh = fleet.mesh("x")
     journal = Journal(mesh, tmp_path, JournalConfig(), 2.0, wall=lambda: START + mesh.now() / SECOND)
     journal.start()
-    journal.hear(published(1, [holder(1, "robot/a")], begun={1: 0.0}))
+    journal.observe(published(1, [holder(1, "robot/a")], begun={1: 0.0}))
     await asyncio.sleep(10)
     key = mesh.keys.history("x", Sender("all", "watcher"))
     (gap,) = (await answer(fleet.watcher, key, HistoryAsk(), History)).gaps
@@ -274,7 +274,7 @@ async def test_more_than_can_be_kept_is_a_gap(tmp_path: Path, monkeypatch: pytes
     journal, rcm = told.journals["x"], told.candidates["x"].rcm
     assert rcm is not None
     for number in range(1, 31):
-        journal.hear(published(rcm.seq + number, term=rcm.term))
+        journal.observe(published(rcm.seq + number, term=rcm.term))
     found = await told.tells(lambda found: found.gaps)
     (count,) = [gap.count for gap in found.gaps if gap.cause == "dropped"]
     assert count >= 10

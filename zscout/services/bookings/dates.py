@@ -91,7 +91,7 @@ def _repeated(booking: BookingRecord, after: float) -> Iterator[Instant]:
         count += 1
 
 
-def told(time: float, zone: str) -> str:
+def in_zone(time: float, zone: str) -> str:
     """Format an instant for people in `zone`."""
     with suppress(ValueError, OverflowError):
         return datetime.fromtimestamp(time, zone_of(zone)).strftime("%Y-%m-%d %H:%M:%S %Z")

@@ -109,7 +109,7 @@ class BookingKeeper:
         self._synchronised = synchronised
         self.records = Records()
         self._offset: Ns | None = None  # fleet time minus the own clock, at the last publication
-        self.heard: tuple[Term, Ns] = NO_TERM, 0  # term and time of that publication
+        self.received: tuple[Term, Ns] = NO_TERM, 0  # term and time of that publication
         self._run: Ns = 0  # fleet time at the start of its run, by that publication; a correction moves it
         self._leader: tuple[Term, Ns, Ns] = NO_TERM, 0, 0
         """The present leader's term, and the times of its first and last publication."""
@@ -131,7 +131,7 @@ class BookingKeeper:
             self.mesh.serve(key, messages.ShareBookings, guard(self._on_shared), limit=messages.MAX_STATE)
         ]
         if not self._candidate:
-            # Candidates call `hear` themselves. Other hosts need no fleet time, but watch the leader.
+            # Candidates call `observe` themselves. Other hosts need no fleet time, but watch the leader.
             watch = guard(lambda _key, grants: self._check_queried(grants))
             self._declared.append(self.mesh.subscribe(keys.grants, messages.Grants, watch))
 
@@ -139,21 +139,21 @@ class BookingKeeper:
         for declared in self._declared:
             declared.close()
 
-    def hear(self, grants: messages.Grants) -> None:
+    def observe(self, grants: messages.Grants) -> None:
         """Take a publication of the leader. A delayed publication, such as an earlier leader's after a stall, shows too
         early a time; the start of the run of fleet time does not depend on the delay. A leader that began without fleet
         time has a younger time, until it learns ours."""
         if grants.time is None:
             return
         self._check_queried(grants)
-        now, (_, at) = self.mesh.now(), self.heard
+        now, (_, at) = self.mesh.now(), self.received
         offset, run = round(grants.time * SECOND) - now, round((grants.time - grants.time_age) * SECOND)
         if self._offset is not None:
             if abs(run - self._run) <= SAME * SECOND:
                 offset = max(offset, self._offset - (now - at) // APART)
             elif grants.time_age < self.age - SAME:
                 return
-        self._offset, self._run, self.heard = offset, run, (grants.term, now)
+        self._offset, self._run, self.received = offset, run, (grants.term, now)
 
     def _check_queried(self, grants: messages.Grants) -> None:
         """Suspect the link if a leader with fleet time does not query this keeper."""
@@ -190,15 +190,15 @@ class BookingKeeper:
             self._saved = digest
         return True
 
-    def told(self, digest: str, *, durable: bool) -> messages.BookingsKept:
+    def answer_to(self, digest: str, *, durable: bool) -> messages.BookingsKept:
         """The answer to a leader with this `digest`, with records if they differ."""
-        own, heard = self.records.digest(), self.time
+        own, fleet_time = self.records.digest(), self.time
         return messages.BookingsKept(
             self.mesh.me.host,
             self._candidate,
             self.wall(),
             own,
-            time=None if heard is None else heard / SECOND,
+            time=None if fleet_time is None else fleet_time / SECOND,
             time_age=self.age,
             durable=durable,
             records=[] if own == digest else list(self.records),
@@ -215,7 +215,7 @@ class BookingKeeper:
         if self.records.take(query.message.records):
             self.shared.set()
         if self._disk is None or self.records.digest() == self._saved:
-            query.answer(self.told(query.message.digest, durable=self._disk is not None))
+            query.answer(self.answer_to(query.message.digest, durable=self._disk is not None))
             return
         self._waiting += 1
         self._supervisor.spawn(self._answer_saved(query))
@@ -225,4 +225,4 @@ class BookingKeeper:
             durable = await self.save()
         finally:
             self._waiting -= 1
-        query.answer(self.told(query.message.digest, durable=durable))
+        query.answer(self.answer_to(query.message.digest, durable=durable))

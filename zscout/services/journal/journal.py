@@ -107,16 +107,16 @@ class Journal:
         await asyncio.wait([self._keeping], timeout=ENDS_WITHIN)
         await self._supervisor.close()
 
-    def hear(self, grants: Grants) -> None:
+    def observe(self, grants: Grants) -> None:
         """Take each publication of the leader, heartbeats included. Never raises: candidates also lead without a
         journal."""
         try:
             if self._supervisor.active:
-                self._hear(grants)
+                self._observe(grants)
         except Exception as error:  # noqa: BLE001 - `fail` logs it
             self._supervisor.fail(error)
 
-    def _hear(self, grants: Grants) -> None:
+    def _observe(self, grants: Grants) -> None:
         now, at, number = self._mesh.now(), self._wall(), (grants.term, grants.seq)
         silence = 0.0 if self._at is None else (now - self._at) / SECOND
         ahead, before = at - now / SECOND, self._ahead

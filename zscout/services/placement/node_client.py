@@ -39,9 +39,9 @@ class NodeClient:
                 reply = await self._ask(command.host, listing, messages.ComponentList, LIST_TIMEOUT)
                 if reply is None or reply.message is None:
                     return None
-                told = reply.message.kinds
+                listed = reply.message.kinds
                 # A truncated list does not show which kinds are missing.
-                kinds = None if told is None or len(told) >= MAX_KINDS else frozenset(told)
+                kinds = None if listed is None or len(listed) >= MAX_KINDS else frozenset(listed)
                 return events.ComponentsListed(command.host, reply.message.components, listing.component, kinds)
 
     async def _start(self, host: HostName, start: messages.StartComponent) -> events.StartAnswered:

@@ -38,7 +38,7 @@ from zscout.scheduling.booking import (
 from zscout.scheduling.core import Core
 from zscout.scheduling.model import ArcRequest, Effect
 from zscout.scheduling.reason import Reason
-from zscout.services.bookings.dates import DAY, Repetition, told
+from zscout.services.bookings.dates import DAY, Repetition, in_zone
 from zscout.services.bookings.fleet_clock import FleetClock
 from zscout.services.bookings.records import Records
 from zscout.types import SECOND, Grant, Need, Ns, RcName
@@ -369,7 +369,7 @@ class BookedDates:
         return bool(over) or lapsed
 
     def _text(self, zone: str, time: Ns) -> str:
-        return told(self.to_fleet(time) / SECOND, zone)
+        return in_zone(self.to_fleet(time) / SECOND, zone)
 
     def dangers(self) -> dict[str, str]:
         """By the core's name of a date: the reason that it may not begin, as text for people."""

@@ -38,7 +38,7 @@ from zscout.scheduling.booking import Booking
 from zscout.scheduling.core import Core
 from zscout.scheduling.model import Propose
 from zscout.scheduling.runtimes import RuntimeEstimator
-from zscout.services.bookings.dates import DAY, dates, told, zone_of
+from zscout.services.bookings.dates import DAY, dates, in_zone, zone_of
 from zscout.services.bookings.records import Records
 from zscout.services.rcm.booked_dates import MAX_CLAIMS, BookedDates, Date, start_of
 from zscout.types import SECOND, Need, Ns
@@ -135,7 +135,7 @@ class BookingHandler:
         self._check_length(wanted.runtime)
         over = wanted.start + min(patience, runtime) / SECOND
         if over <= time:
-            date, now = told(wanted.start, wanted.zone), told(time, wanted.zone)
+            date, now = in_zone(wanted.start, wanted.zone), in_zone(time, wanted.zone)
             raise Refused("bad_date", f"{date} is in the past; by the fleet's clock it is {now}")
         last = wanted.until if wanted.every and wanted.until is not None else wanted.start
         if max(last, wanted.start) > time + MAX_AHEAD:
@@ -203,7 +203,7 @@ class BookingHandler:
             return False
         self._dates.change(record, kept=bound)
         self._dates.out.events.append(self._dates.reconcile())
-        when = told(record.start, record.zone)
+        when = in_zone(record.start, record.zone)
         self._dates.out.log.append(f"{record.owner} books {record.name}: {', '.join(record.needs)} at {when}")
         self._answer_kept(ticket, record, withdraw=True)
         return True
@@ -220,7 +220,7 @@ class BookingHandler:
         why = (
             f"booked then: {'; '.join(names)}{more}" if names else "held, in maintenance or promised to queued requests"
         )
-        return f"not all of {', '.join(date.record.needs)} are free at {told(date.start, date.record.zone)}: {why}"
+        return f"not all of {', '.join(date.record.needs)} are free at {in_zone(date.start, date.record.zone)}: {why}"
 
     def _share(self, booking: Booking, other: Booking) -> bool:
         """Return True if `other` needs an RC that `booking` has."""
@@ -263,7 +263,7 @@ class BookingHandler:
         elif operation.start in dates(record, operation.start, operation.start + 1):
             new = self._dates.change(record, dropped=sorted({*record.dropped, operation.start}))
         else:
-            date = told(operation.start, record.zone)
+            date = in_zone(operation.start, record.zone)
             raise Refused("bad_date", f"{date} is not a date of {record.name}; see zscout booking list")
         self._dates.out.events.append(self._dates.reconcile())
         self._answer_kept(ticket, new)

@@ -221,7 +221,7 @@ class BookingSharing:
             self._on_stimulus(steps.Shared())
             self._news.set()
         prompt = credible((reply for reply in replies if reply.arrived - asked <= PROMPT), self._mesh.keys, now)
-        hosts = {answer.host: answer for answer in (*prompt, self._keeper.told("", durable=False))}
+        hosts = {answer.host: answer for answer in (*prompt, self._keeper.answer_to("", durable=False))}
         walls = {host: wall_ns(answer.wall) for host, answer in hosts.items()}
         self._ahead = {host: wall - now for host, wall in walls.items()}
         believed = {*(answer.host for answer in answers), self._mesh.me.host}

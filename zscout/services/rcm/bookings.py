@@ -287,10 +287,10 @@ def oldest(answers: Iterable[BookingsKept]) -> tuple[float, Ns] | None:
 def _time(keeper: BookingKeeper, kept: Sequence[BookingsKept]) -> tuple[Ns, float]:
     """Fleet time, and the seconds for which it has run: the oldest of any host; if no host has one, the median of the
     hosts' clocks, from now on."""
-    found = oldest([*kept, keeper.told("", durable=False)])
+    found = oldest([*kept, keeper.answer_to("", durable=False)])
     if found is not None:
         return found[1], found[0]
-    hosts = {answer.host: answer for answer in (*kept, keeper.told("", durable=False))}.values()
+    hosts = {answer.host: answer for answer in (*kept, keeper.answer_to("", durable=False))}.values()
     return agreed(
         (wall_ns(host.wall) for host in hosts), kept=[wall_ns(host.wall) for host in hosts if host.synchronised]
     ), 0.0

@@ -22,14 +22,14 @@ class Learned:
 
     def hear(self, now: Ns, grants: Grants) -> None:
         """Take in a publication of a believed term."""
-        self.keeper.hear(grants)
+        self.keeper.observe(grants)
         self.runtimes.hear(now, grants)
         if grants.charged:
             self._charged = grants.charged, now
         if grants.patience is not None:
             self.patience = round(grants.patience * SECOND)
         if self._journal is not None:
-            self._journal.hear(grants)
+            self._journal.observe(grants)
 
     def charged(self, now: Ns, half_life: Ns) -> dict[str, float]:
         """Usage per group, decayed since its publication (`fair_shares.py`)."""
