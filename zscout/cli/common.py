@@ -146,8 +146,8 @@ async def see_rcm(client: Client, seconds: float = FIND_RCM_S) -> None:
 
     try:
         await client.see_rcm(seconds, AWAIT_TAKEOVER_S)
-    except NoRcm as nobody:
-        raise NobodyThere(str(nobody).replace(f"(${FLEET_VARIABLE})", f"(--fleet, ${FLEET_VARIABLE})")) from None
+    except NoRcm as error:
+        raise NobodyThere(str(error).replace(f"(${FLEET_VARIABLE})", f"(--fleet, ${FLEET_VARIABLE})")) from None
 
 
 async def state_of(client: Client, arc: str | None = None, *, forecast: bool = False) -> RcmState:

@@ -14,14 +14,14 @@ def ending(name: str, left: float) -> str:
 
 
 def absence(view: RcView) -> str:
-    """Why the device is absent, if that is known."""
+    """Return the reason that the device is absent; empty: present, or unknown."""
     if view.present or not view.reason:
         return ""
     return view.reason if view.gone is None else f"{view.reason} since {clock(-view.gone)}"
 
 
 def unwell(device: RcState | None) -> str:
-    """Why a device that is not lost does not work at present; empty: it does."""
+    """Return the reason that a device does not work at present though it is not lost; empty: it works."""
     if device is None or device.unwell is None or device.health != "ok":
         return ""
     report = device.unwell
@@ -29,7 +29,7 @@ def unwell(device: RcState | None) -> str:
 
 
 def remarks(view: RcView) -> Iterator[str]:
-    """Why the device is absent, and which other hosts offer it or did so."""
+    """Yield the reason that the device is absent, and other hosts that offer it or did so."""
     if words := absence(view):
         yield words
     for host in view.duplicates:

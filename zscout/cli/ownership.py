@@ -69,7 +69,7 @@ async def confirm(question: str, unasked: str, no: str, *, code: int | None = No
 
 
 async def _answer() -> str:
-    """One line from the terminal. Unlike input() it lets Ctrl-C through to the event loop."""
+    """Read a line from the terminal. Unlike with input(), Ctrl-C reaches the event loop."""
     loop = asyncio.get_running_loop()
     readable = asyncio.Event()
     loop.add_reader(0, readable.set)

@@ -78,7 +78,7 @@ def test_a_fleet_that_is_well_has_nothing_to_mend() -> None:
     ]  # fmt: skip
     closed = findings(seen(CLOSED, certificates=certificates()))
     assert [one.about for one in closed if one.state != "ok"] == []
-    assert closed[0].says == "fleet zscout (lab.toml), looked at as ada"
+    assert closed[0].says == "fleet zscout (lab.toml), checked as ada"
     assert closed[1].says == "keys/cert.pem: ada, by CA one, until 2027-04-30 12:00 UTC"
 
 

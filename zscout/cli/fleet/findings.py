@@ -101,7 +101,7 @@ def _the_fleet(seen: Evidence) -> Fleet:
 
 def _files(seen: Evidence) -> Iterator[Finding]:
     by = seen.file or "no file is named: the default"
-    yield Finding("files", "ok", f"fleet {_the_fleet(seen).name} ({by}), looked at as {seen.host}")
+    yield Finding("files", "ok", f"fleet {_the_fleet(seen).name} ({by}), checked as {seen.host}")
 
 
 def _certificate(seen: Evidence) -> Iterator[Finding]:

@@ -58,7 +58,7 @@ class Selection:
         return not self.names or rc in self._rcs
 
     def missing(self) -> common.Failed | None:
-        """The error to raise if one of the names was not found."""
+        """Return the error for a name that was not found; None if all were."""
         name = next((name for name in self.names if name not in self._met), None)
         if name is None:
             return None

@@ -30,7 +30,7 @@ _POLICY: Final = (
 
 
 def silent(folder: Path) -> Mapping[str, str]:
-    """The environment of a viewer that reports nothing; its configuration goes into `folder`."""
+    """Return the environment of a viewer without usage reports; write its configuration into `folder`."""
     config = folder / "rerun" / "analytics.json"
     config.parent.mkdir()
     # Rerun replaces a file that lacks a field by its own.

@@ -183,7 +183,7 @@ class UsedToken:
         try:
             self.file: TokenFile = token_files.read(path)
         except (OSError, msgspec.DecodeError) as error:
-            raise Failed(f"{path} can't be read: {error}") from None
+            raise Failed(f"{path} can't be read: {error}; remove it, and acquire the devices again") from None
         if self.file.ended:
             raise Failed(f"{self.file.arc} has ended: {self.file.ended}; acquire the devices again", self.file.code)
         channel = token_files.connect(path)

@@ -604,7 +604,7 @@ def _how(arc: OpenArc) -> tuple[str, str, int | None]:
 
 
 def _reason_words(arc: OpenArc, client: Client) -> str:
-    """Why it waits, as the user of `client` reads it now."""
+    """Words for the reason that the request waits, for the user of `client`, at this moment."""
     return reason_text(arc.reason, arc.why, (client.mesh.now() - arc._notified_at) / SECOND, User.of(client))
 
 
