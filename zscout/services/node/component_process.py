@@ -68,7 +68,7 @@ class ComponentProcess:
         self._child: subprocess.Popen[bytes] | None = None
         self._orders: asyncio.Queue[bytes] | None = None  # messages to its process, while connected
         self._group = ComponentGroup(0, 0)
-        self._verdict: EndReport | None = None  # the outcome if this node kills it
+        self._verdict: EndReport | None = None  # the outcome, if this node decides it
         self._end_report: EndReport | None = None
         self._gone = False  # its process ended, cleanup continues
         self._waiting: dict[int, asyncio.Future[OrderAnswer]] = {}
