@@ -163,7 +163,7 @@ async def test_how_one_ended_is_told_as_it_was(lab: ComponentLab) -> None:
     assert ends["raise"].reason == "RuntimeError: the camera fell off"
     assert quiet(ends["raise"].tail).startswith("last words\nTraceback")
     assert ends["raise"].tail.endswith("RuntimeError: the camera fell off\n")
-    assert "left with 3" in ends["exit"].reason
+    assert "exited with 3" in ends["exit"].reason
     assert "without a report" in ends["vanish"].reason
     assert ends["abort"].reason == "killed by SIGABRT"
     assert quiet(ends["abort"].tail) == "last words\n"

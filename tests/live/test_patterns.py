@@ -42,7 +42,7 @@ async def test_each_gets_a_free_one_and_who_waits_the_first_that_is_given_back(l
         (mine,) = set(BOTH) & set(one.rcs)
         assert (one.rc(ANY), one.rcs) == (mine, [mine, "robot/x"])
         assert [await echo(one, need) for need in (ANY, mine, "robot/x")] == [ANY, mine, "robot/x"]
-        with pytest.raises(KeyError, match="is not a need of one; it asked for framegrabber/"):
+        with pytest.raises(KeyError, match="is not a need of one; it requested framegrabber/"):
             await one.command(MORE, {"name": "echo", "value": 1})
         (told,) = (await lab.rc(client, mine)).holders
         assert (told.rcs, told.bound) == (one.rcs, {ANY: mine})

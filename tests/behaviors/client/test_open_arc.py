@@ -75,7 +75,7 @@ def runs(bound: dict[str, str], step: int = 2, grant: Grant = FIRST) -> Notice:
             [RUNS, AGAIN],
             "running",
             SECOND_GRANT,
-            ("lost", "the leader took this client for gone; it is granted again", None),
+            ("lost", "the leader considered this client gone; it is granted again", None),
         ),
         ([RUNS, notice(3, "ended", outcome="completed")], "ended", None, ("completed", "", None)),
         ([RUNS, notice(1)], "running", FIRST, None),
@@ -105,7 +105,7 @@ def test_what_meets_a_pattern_is_what_the_newest_hold_says() -> None:
     assert first.rc("fg/*") == "fg/b"
     assert known._ask(NOW).needs.keys() == {"fg/*", "fg/*#2", "robot/x"}
     for unasked in ("fg/*#3", "video/*", "robot/y", "fg/b"):
-        with pytest.raises(KeyError, match=re.escape(f"{unasked} is not a need of survey; it asked for fg/*,")):
+        with pytest.raises(KeyError, match=re.escape(f"{unasked} is not a need of survey; it requested fg/*,")):
             again.rc(unasked)
 
 

@@ -68,7 +68,7 @@ class Held:
         rc = self.bound.get(need, need)
         if rc not in self.rcs:
             asked = ", ".join(sorted(self.arc.needs))
-            raise KeyError(f"{need} is not a need of {self.arc.name}; it asked for {asked}")
+            raise KeyError(f"{need} is not a need of {self.arc.name}; it requested {asked}")
         return rc
 
     def now(self) -> Ns:
@@ -287,7 +287,7 @@ class Attempt:
                 # Its time is over by this host's clock. A new leader during the cleanup would queue it again.
                 self._client.internals.expire(held.arc)
             await asyncio.sleep(max(0, direct.gone_by - held.now()) / SECOND)
-            log.warning("%s cleans up too long after its hold; interrupting it, the next holder begins", held.arc.name)
+            log.warning("%s still cleans up, and the next hold begins: interrupting it", held.arc.name)
             self._cancel(body)
 
     def _cancel(self, body: asyncio.Task[Any]) -> None:

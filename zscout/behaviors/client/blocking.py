@@ -269,9 +269,7 @@ class BlockingAttempt(AbstractContextManager[BlockingHeld, None]):
             await held._body.interrupt()
         if interrupts and direct is not None:
             await asyncio.sleep(max(0, direct.gone_by - held._held.now()) / SECOND)
-            log.warning(
-                "%s cleans up too long after its hold; interrupting it, the next holder begins", direct.arc.name
-            )
+            log.warning("%s still cleans up, and the next hold begins: interrupting it", direct.arc.name)
             held._body.notified = False
             await held._body.interrupt()
 

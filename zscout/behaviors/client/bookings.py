@@ -205,7 +205,7 @@ class BookingsClient:
         keys, me = self._mesh.keys, self._mesh.me
         if keys.closed and (why := self._client.fleet.access.refusal(me.host, "book", USERS)):
             raise RequestRefused(Problem("not_allowed", why))
-        silent = "did not answer; it may or may not have been done: see zscout booking list, and try again"
+        silent = "did not answer; the operation may or may not have been done: see zscout booking list, and try again"
         return await self._ask_until_answered(keys.schedule(me), operation, kind, self._timeout, silent)
 
     async def _ask_until_answered(self, key: str, question: Message, kind: type[M], within: float, silent: str) -> M:

@@ -138,11 +138,11 @@ class Confirmations:
     def _give_back(self, arc: OpenArc, confirmation: Confirmation, refusals: list[CommandRefused]) -> None:
         if other := [refused for refused in refusals if refused.code not in NOT_CONFIRMED | {SETTLING}]:
             confirmation.refused = other[0]
-            log.warning("%s is not confirmed: %s", arc.name, other[0])
+            log.warning("grant of %s refused: %s", arc.name, other[0])
             return
         rcs = [refused.rc for refused in refusals if refused.code != SETTLING]
         if rcs:
-            log.warning("the grant of %s is given back: %s", arc.name, refusals[0])
+            log.warning("giving back the grant of %s: %s", arc.name, refusals[0])
             arc._not_confirmed(rcs, str(refusals[0]), self._mesh.now())
             self._supervisor.spawn(self._ask_when_reachable(arc, rcs))
         else:

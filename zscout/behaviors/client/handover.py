@@ -59,7 +59,7 @@ class MovableClient:
         A request that was handed over and not claimed within 10 s is given back. Raises BadName, and ValueError for
         more than 256 requests, or one that is already open here."""
         if len(requests) > MAX_OTHERS + 1:
-            raise ValueError(f"{len(requests)} requests are too many to take over; at most {MAX_OTHERS + 1} are")
+            raise ValueError(f"can't take over {len(requests)} requests; the limit is {MAX_OTHERS + 1}")
         now = self.mesh.now()
         arcs = {request.id: OpenArc._expected(request, now) for request in requests}
         if here := arcs.keys() & self.store.arcs.keys():
@@ -183,10 +183,10 @@ class MovableClient:
         Raises RequestRefused if the RCM refuses. With code `unknown` the outcome is unknown after 10 s: call it again,
         or make sure that the other client is gone (an earlier RCM may have notified it) and call `take_back`."""
         if not self.paused:
-            raise RuntimeError("pause() the client before it hands over everything: it would ask for it again")
+            raise RuntimeError("pause() the client before hand_over_all(): it would submit the requests again")
         arcs = sorted(self.store.acknowledged, key=lambda arc: arc.grant is None)
         if len(arcs) > MAX_OTHERS + 1:
-            words = f"{len(arcs)} requests can't be handed over at once; {MAX_OTHERS + 1} can"
+            words = f"can't hand over {len(arcs)} requests at once; the limit is {MAX_OTHERS + 1}"
             raise RequestRefused(Problem("too_many", words))
         try:
             async with asyncio.timeout(HAND_OVER):

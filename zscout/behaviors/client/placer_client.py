@@ -68,7 +68,7 @@ class PlacerClient:
         """Repeat an operation, which must be idempotent, until a placer answers. Raises RequestRefused,
         PlacerSilent."""
         silent = f"the component placer of fleet {self.mesh.keys.fleet} did not answer for {self._timeout:.0f} s"
-        remedy = "see zscout status, and the log of zscout-node where it leads"
+        remedy = "see zscout status, and the leader's log of zscout-node"
         return await self._until(lambda: self._ask(operation, kind), f"{silent}; {remedy}")
 
     async def request_once(self, operation: PlacementOperation, done: Callable[[Placement], bool]) -> Placement:

@@ -155,7 +155,7 @@ class OpenArc:
         arc = cls(id_, name, request.needs, request.priority, request.min_runtime, request.keep, _place=request.place)
         arc.direct, arc.continues, arc.booking = request.direct, request.continues, request.booking
         arc.who = request.who and msgspec.structs.replace(request.who, host="")
-        arc.state, arc.reason = "expected", "another client is to hand it over"
+        arc.state, arc.reason = "expected", "waiting for another client to hand it over"
         arc.since, arc._waits_since = now, now - round(request.waited * SECOND)
         return arc
 
@@ -185,7 +185,7 @@ class OpenArc:
         if notice.state != "running":
             self._end_hold(HoldEnd(notice.outcome or "lost", notice.reason, notice.by), now)
         elif notice.grant != self.grant:
-            self._end_hold(HoldEnd("lost", "the leader took this client for gone; it is granted again"), now)
+            self._end_hold(HoldEnd("lost", "the leader considered this client gone; it is granted again"), now)
         self.state = notice.state
         self.reason, self.why = notice.reason, notice.why
         self.outcome, self.by = notice.outcome, notice.by
@@ -282,7 +282,7 @@ class OpenArc:
 
     def _await_again(self, notice: Notice, now: Ns) -> None:
         """Await the repeated hand-over."""
-        self._lose("its old client is to hand it over once more", now)
+        self._lose("waiting for its old client to hand it over again", now)
         self.state, self._moved_in, self._last = "awaited", None, (notice.term, notice.step)
 
     def _go_back(self, term: Term) -> None:
@@ -474,7 +474,7 @@ class RequestStore:
     def _submit_under_new_id(self, arc: OpenArc) -> None:
         """Submit under a new id, at its place, a request whose time was over before this client had its grant."""
         del self.arcs[arc.id]
-        arc._take_back(new_instance(), "it had its time before this client heard of it", self._now())
+        arc._take_back(new_instance(), "its time was over before this client learned of the grant", self._now())
         arc.booking = ""  # the booking's time is over too
         self.arcs[arc.id] = arc
         self._ask_again(arc)

@@ -187,7 +187,7 @@ class ComponentLifecycle:
             raise BadParams(f"bad parameters: {_error_line(error, named=False)}") from None
         except Exception as error:  # noqa: BLE001 - the author's code
             traceback.print_exc()
-            raise BadKind(f"it can't be made: {_error_line(error)}") from None
+            raise BadKind(f"its constructor failed: {_error_line(error)}") from None
 
     async def _perform(self, client: Client, component: Component, movable: bool) -> EndReport:
         start, host = self._job.start, self._job.host
@@ -202,10 +202,10 @@ class ComponentLifecycle:
                 raise
         except SystemExit as left:
             if left.code == BAD_PARAMS:
-                words = f"it left with code {BAD_PARAMS}: its parameters are no good; see its output"
+                words = f"exited with code {BAD_PARAMS}: invalid parameters; see its output"
                 return self._requested_end or EndReport("failed", words, bad_params=True)
             if left.code:
-                return self._requested_end or EndReport("failed", f"it left with {left.code!r}")
+                return self._requested_end or EndReport("failed", f"exited with {left.code!r}")
         except Exception as error:
             if self._requested_end is None:
                 raise
@@ -271,7 +271,7 @@ class ComponentLifecycle:
         component, client = self._movable(standby=True)
         held = [need for request in handed.requests if request.grant is not None for need in request.needs]
         if not await _wait_for_names(client, Role.RC, [matcher(need) for need in held], RC_LINK_TIMEOUT):
-            words = f"{self._job.host} does not reach {', '.join(held)}, or not all of them"
+            words = f"{self._job.host} has no link to all of {', '.join(held)}"
             raise NotMoved("start_failed", words)
         try:
             component.restore(handed.state)

@@ -45,9 +45,9 @@ def state_of(component: Component) -> bytes:
     except Exception as error:
         raise NotMoved("move_failed", f"checkpoint() failed: {error!r}") from error
     if not isinstance(state, bytes):
-        raise NotMoved("move_failed", f"checkpoint() gave {type(state).__name__}; return bytes")
+        raise NotMoved("move_failed", f"checkpoint() returned {type(state).__name__}; return bytes")
     if len(state) > MAX_CHECKPOINT:
-        raise NotMoved("too_large", f"checkpoint() gave {len(state)} bytes; at most {MAX_CHECKPOINT} can be moved")
+        raise NotMoved("too_large", f"checkpoint() returned {len(state)} bytes; the limit is {MAX_CHECKPOINT}")
     return state
 
 
@@ -111,7 +111,7 @@ class OutgoingMove:
     async def _send_state(self, state: bytes, requests: list[OpenRequest]) -> None:
         order = messages.RestoreComponent(self._name, self.incarnation, state, requests)
         if len(messages.encode(order)) > MAX_MOVE:
-            raise NotMoved("too_large", f"state and {len(requests)} requests are more than {MAX_MOVE} bytes")
+            raise NotMoved("too_large", f"state and {len(requests)} requests exceed {MAX_MOVE} bytes")
         deadline = self._client.mesh.now() + round(RESTORE_TIMEOUT * SECOND)
         pause, longest = PAUSES
         left = RESTORE_TIMEOUT

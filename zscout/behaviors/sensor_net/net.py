@@ -51,7 +51,7 @@ class SensorNet:
     def __init__(self, robots: Sequence[str], wanted: int | None = None) -> None:
         """Raises ValueError for no robots, duplicates, or more wanted than named."""
         if not robots or len(set(robots)) != len(robots):
-            raise ValueError("robots must be named, each once")
+            raise ValueError("robots is empty or has duplicates; name each robot once")
         self.wanted = len(robots) if wanted is None else wanted
         if not 1 <= self.wanted <= len(robots):
             raise ValueError(f"wanted is {wanted}; write 1 to {len(robots)}, the robots there are")
