@@ -17,7 +17,9 @@ from click.testing import CliRunner
 from tests.cli import tools
 from tests.hang import HANG
 from tests.live.lab import Lab
-from zscout.behaviors.client.client import RequestRefused
+from zscout.behaviors.client.client import NoRcm, RequestRefused
+from zscout.behaviors.client.remedies import CHECK_FLEET, IN_PYTHON, with_remedy
+from zscout.cli.common import REMEDIES
 from zscout.cli.groups import LazyGroup, booking, component, instead
 from zscout.cli.main import HABITS, HEADINGS, INSTEAD, OLD, explain, main
 from zscout.cli.requests.options import gather_needs, parse_duration, parse_need
@@ -333,8 +335,18 @@ def test_plain_tables_align() -> None:
     ]
 
 
-def test_a_hint_at_an_option_is_one_at_an_argument_in_a_program() -> None:
-    hint = "unknown device robot/a; to wait for it anyway, "
-    refused = RequestRefused(Problem("unknown_device", f"{hint}add --wait-for-device"))
-    assert str(refused) == f"{hint}pass wait_for_device=True"
-    assert explain(refused) == (2, f"zscout: {hint}add --wait-for-device")
+@pytest.mark.parametrize("fault", ["unknown device robot/a;", "unknown device robot/a; did you mean robot/b?"])
+def test_a_remedy_is_an_option_here_and_an_argument_in_a_program(fault: str) -> None:
+    refused = RequestRefused(Problem("unknown_device", fault.removesuffix(";"), remedy="wait_for_device"))
+    assert str(refused) == f"{fault} to wait anyway, pass wait_for_device=True"
+    assert explain(refused) == (2, f"zscout: {fault} to wait anyway, add --wait-for-device")
+
+
+def test_every_remedy_has_words_in_python_and_here() -> None:
+    assert REMEDIES.keys() == IN_PYTHON.keys()
+    assert not any("--" in words for words in IN_PYTHON.values())
+    unknown = Problem("unknown_device", "unknown device robot/a", remedy="of_a_newer_leader")
+    assert explain(RequestRefused(unknown)) == (2, "zscout: unknown device robot/a")
+    no_leader = NoRcm("no leader is on the mesh", CHECK_FLEET)
+    assert "($ZSCOUT_FLEET)" in str(no_leader)
+    assert "(--fleet, $ZSCOUT_FLEET)" in with_remedy(no_leader.fault, no_leader.remedy, REMEDIES)

@@ -32,6 +32,14 @@ FIND_RCM_S: Final = 2.0
 """Within this time the token of an RCM is seen."""
 AWAIT_TAKEOVER_S: Final = 5.0
 """The same if a candidate is seen: it may be about to take the lead."""
+REMEDIES: Final[Mapping[str, str]] = {
+    "wait_for_device": "to wait anyway, add --wait-for-device",
+    "check_fleet": (
+        f"start zscout-node on a host, or check the fleet file (--fleet, ${FLEET_VARIABLE}): `zscout doctor` finds the "
+        "cause"
+    ),
+}
+"""What an error proposes at the command line, by its code."""
 STATE_TRIES: Final = 3
 MAX_NAMED: Final = 8
 """Known names that an error lists."""
@@ -143,11 +151,12 @@ async def see_rcm(client: Client, seconds: float = FIND_RCM_S) -> None:
     """Return as soon as an RCM is seen. Raises NobodyThere after `seconds` without an RCM, or after a longer time if a
     candidate may be about to lead."""
     from zscout.behaviors.client.client import NoRcm
+    from zscout.behaviors.client.remedies import with_remedy
 
     try:
         await client.see_rcm(seconds, AWAIT_TAKEOVER_S)
     except NoRcm as error:
-        raise NobodyThere(str(error).replace(f"(${FLEET_VARIABLE})", f"(--fleet, ${FLEET_VARIABLE})")) from None
+        raise NobodyThere(with_remedy(error.fault, error.remedy, REMEDIES)) from None
 
 
 async def state_of(client: Client, arc: str | None = None, *, forecast: bool = False) -> RcmState:

@@ -168,8 +168,8 @@ def explain(error: BaseException) -> tuple[int, str] | None:
     from zscout.behaviors.client.bookings import RcmSilent
     from zscout.behaviors.client.client import CommandRefused, RequestRefused
     from zscout.behaviors.client.placer_client import PlacerSilent
-    from zscout.behaviors.client.request import HINT
-    from zscout.cli.common import Failed, Interrupted
+    from zscout.behaviors.client.remedies import with_remedy
+    from zscout.cli.common import REMEDIES, Failed, Interrupted
     from zscout.config.strict import BadInput
     from zscout.keyexpr import BadName
     from zscout.mesh import MeshError
@@ -187,7 +187,7 @@ def explain(error: BaseException) -> tuple[int, str] | None:
         case PlacerSilent() | RcmSilent():
             return NOBODY, words
         case RequestRefused(code=code) if code in ADMISSION_CODES:
-            return BAD_INPUT, words.replace(HINT[1], HINT[0])
+            return BAD_INPUT, f"zscout: {_line(with_remedy(error.fault, error.remedy, REMEDIES))}"
         case RequestRefused() | CommandRefused() | MeshError() | DemoFailed():
             return COULD_NOT, words
     return None

@@ -79,14 +79,16 @@ class Problem(Message, frozen=True):
     left: Seconds | None = None
     version: VersionText = ""
     """Version of the replier, in refusals that a version difference may explain."""
+    remedy: str = ""
+    """A code for what the requester may do, if `message` does not say it: `wait_for_device`."""
 
 
 class Refused(Exception):
     """Raised by a handler to answer a query with an error."""
 
-    def __init__(self, code: str, message: str, term: Term | None = None) -> None:
+    def __init__(self, code: str, message: str, term: Term | None = None, remedy: str = "") -> None:
         super().__init__(message)
-        self.problem = Problem(code, message, term)
+        self.problem = Problem(code, message, term, remedy=remedy)
 
     @classmethod
     def by(cls, problem: Problem) -> Refused:

@@ -27,7 +27,7 @@ class DeviceCheck:
 
     def check(self, now: Ns, needs: Mapping[Need, Amounts], *, waits: bool = False, may_wait: bool = True) -> None:
         """Raises Refused for unknown devices and for more RCs of a pattern than match it, unless the request `waits`
-        for them; and for parameters that no matching RC accepts. `may_wait`: the remedy mentions that option."""
+        for them; and for parameters that no matching RC accepts. `may_wait`: the remedy is to wait."""
         waits, expected, is_there = waits or now < self._settles, self._devices.names, self._roster.is_known
         wanted = Counter(need.partition("#")[0] for need in needs if is_pattern(need))
         for need, params in needs.items():
@@ -59,16 +59,17 @@ def _too_few(pattern: str, left: Sequence[RcName], wanted: Mapping[str, int], *,
         else f"{pattern} is requested"
     )
     there = f"only {', '.join(left[:MAX_NAMED])}" if left else "none but those you named"
-    more = ", or to wait for more, add --wait-for-device" if may_wait else ""
-    return Refused("unknown_device", f"{what}, but {there} can be used; request fewer{more}")
+    remedy = "wait_for_device" if may_wait else ""
+    return Refused("unknown_device", f"{what}, but {there} can be used; request fewer", remedy=remedy)
 
 
 def _unknown(need: Need, known: Collection[RcName], *, may_wait: bool) -> Refused:
     near = difflib.get_close_matches(need, known, n=3)
-    hint = f"did you mean {' or '.join(near)}? " if near else ""
+    hint = f"; did you mean {' or '.join(near)}?" if near else ""
     what = f"no device matches {need}" if is_pattern(need) else f"unknown device {need}"
-    remedy = "to wait for it anyway, add --wait-for-device" if may_wait else "zscout status lists all devices"
-    return Refused("unknown_device", f"{what}; {hint}{remedy}")
+    if may_wait:
+        return Refused("unknown_device", f"{what}{hint}", remedy="wait_for_device")
+    return Refused("unknown_device", f"{what}{hint or '; zscout status lists all devices'}")
 
 
 def _objection(rc: RcName, params: Amounts, parameters: Parameters | None) -> Refused | None:

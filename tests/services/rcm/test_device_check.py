@@ -40,7 +40,8 @@ def refusal(*needs: str, waits: bool = False, may_wait: bool = True, params: Map
     try:
         DeviceCheck(devices, nobody, 0).check(0, wanted, waits=waits, may_wait=may_wait)
     except Refused as refused:
-        return f"{refused.problem.code}: {refused.problem.message}"
+        problem = refused.problem
+        return f"{problem.code}: {problem.message}" + (f" ({problem.remedy})" if problem.remedy else "")
     return ""
 
 
@@ -65,8 +66,8 @@ def test_what_may_start_is_let_in(need: str, params: dict[str, float]) -> None:
 @pytest.mark.parametrize(
     ("need", "params", "words"),
     [
-        ("robot/arn1", {}, "unknown_device: unknown device robot/arn1; did you mean robot/arm1? to wait for it anyway"),
-        ("tank/*", {}, "unknown_device: no device matches tank/*; to wait"),
+        ("robot/arn1", {}, "unknown_device: unknown device robot/arn1; did you mean robot/arm1?"),
+        ("tank/*", {}, "unknown_device: no device matches tank/*"),
         ("radio/rf0", {"command_rate": 50}, "too_much: can never start: command_rate 50 of 10 packets/s at radio/rf0"),
         ("radio/*", {"command_rate": 101}, "too_much: can never start: command_rate 101 of 10"),
         ("radio/rf0", {"comand_rate": 5}, "unknown_parameter: radio/rf0 has no parameter comand_rate; did you mean"),
@@ -88,7 +89,7 @@ def test_what_can_never_start_is_refused_with_what_to_mend(need: str, params: di
             "unknown_device: 3 devices that match radio/* are requested, but only radio/rf0, radio/rf1 can be used",
         ),
         (["robot/*", "robot/arm1"], "unknown_device: robot/* is requested, but none but those you named"),
-        (["tank/*"], "unknown_device: no device matches tank/*; "),
+        (["tank/*"], "unknown_device: no device matches tank/*"),
     ],
 )
 def test_more_of_a_pattern_than_the_fleet_knows_of_is_refused(needs: list[str], words: str) -> None:
@@ -97,8 +98,8 @@ def test_more_of_a_pattern_than_the_fleet_knows_of_is_refused(needs: list[str], 
     assert bool(refused) is bool(words)
     may_wait = refusal(*needs)
     assert may_wait.startswith(words)
-    assert ("add --wait-for-device" in may_wait) is bool(words)
-    assert "--wait-for-device" not in refused
+    assert may_wait.endswith(" (wait_for_device)") is bool(words)
+    assert "wait_for_device" not in refused
     assert refusal(*needs, waits=True) == ""
 
 

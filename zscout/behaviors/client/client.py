@@ -16,6 +16,7 @@ from zscout.behaviors.client.confirmation import NOT_DONE
 from zscout.behaviors.client.identity import checked_comment, host_of, this_machine, this_program
 from zscout.behaviors.client.internals import ClientInternals
 from zscout.behaviors.client.rcm_link import QUERY_TIMEOUT, TRY_AGAIN
+from zscout.behaviors.client.remedies import CHECK_FLEET
 from zscout.behaviors.client.request import (
     CommandRefused,
     Needs,
@@ -25,7 +26,7 @@ from zscout.behaviors.client.request import (
     amounts,
     check_seconds,
 )
-from zscout.config.fleet import FLEET_VARIABLE, Fleet, beside, fleet_from_env
+from zscout.config.fleet import Fleet, beside, fleet_from_env
 from zscout.keyexpr import USERS, Role, Sender, Token, check_name, check_new_name, new_instance
 from zscout.mesh import Mesh, ZenohMesh
 from zscout.mesh.exchange import naming_versions
@@ -126,10 +127,7 @@ class Client:
             raise NoRcm(f"{no_leader}, though {names} could lead; see the log of zscout-node there")
         links = self.mesh.links()
         others = f"{links} link{'s' * (links > 1)} to other programs" if links else "no other program either"
-        raise NoRcm(
-            f"{no_leader} ({others}); start zscout-node on a host, or check the fleet file (${FLEET_VARIABLE}): "
-            "`zscout doctor` finds the cause"
-        )
+        raise NoRcm(f"{no_leader} ({others})", CHECK_FLEET)
 
     # Requests
 

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple, Self
 import msgspec
 
 from zscout.behaviors.client.hold_notices import HoldNotice
+from zscout.behaviors.client.remedies import with_remedy
 from zscout.keyexpr import BadName, check_name, check_need, check_rc, is_pattern, matcher, new_instance
 from zscout.messages import Amounts, Ask, Cancel, Notice, OpenRequest, Problem, ReasonInfo, Release, Who, carried
 from zscout.types import NO_TERM, SECOND, Grant, Ns, Place, Term
@@ -20,20 +21,21 @@ from zscout.types import NO_TERM, SECOND, Grant, Ns, Place, Term
 Needs = Mapping[str, Mapping[str, Any]]
 
 
-HINT = ("add --wait-for-device", "pass wait_for_device=True")
-"""The option in a leader's message, and the argument that replaces it in errors for programs."""
-
-
 class RequestRefused(Exception):
-    """The request was refused. The message is the reason; `code` is one of the codes of the protocol."""
+    """The request was refused. The message is the `fault` and what to do about it; `code` is one of the codes of the
+    protocol, and so is `remedy`, if there is one that the program can take."""
 
     def __init__(self, problem: Problem) -> None:
-        super().__init__(problem.message.replace(*HINT))
-        self.code = problem.code
+        super().__init__(with_remedy(problem.message, problem.remedy))
+        self.code, self.fault, self.remedy = problem.code, problem.message, problem.remedy
 
 
 class NoRcm(Exception):
-    """No leader is on the mesh; the message says what to check."""
+    """No leader is on the mesh. The message is the `fault` and what to check; `remedy` is its code."""
+
+    def __init__(self, fault: str, remedy: str = "") -> None:
+        super().__init__(with_remedy(fault, remedy))
+        self.fault, self.remedy = fault, remedy
 
 
 class CommandRefused(Exception):
