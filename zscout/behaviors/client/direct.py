@@ -1,10 +1,10 @@
 """A direct hold on the side of its client: its program also reaches devices past their RCs, which settle until it is
 gone.
 
-Once every RC has confirmed the grant, each confirms it again every third of a hold lease. The hold is safe until a hold
-lease after the last confirmation was *sent* that all RCs have answered (`sure_until`); then it ends, whatever the RCM
-publishes. After any end but the client's own release, the program has less than `settle` to end. The client sends
-`leaving` to the RCs at such an end, and `left` once the program is gone.
+Once every RC has confirmed the grant, each confirms it again every third of a hold lease. An RC's confirmation is good
+for a hold lease from the moment at which the query for it was *sent*. The hold is safe while all are good (until
+`sure_until`); then it ends, even if the RCM publishes it. After any end but the client's own release, the program has
+less than `settle` to end. The client sends `leaving` to the RCs at such an end, and `left` once the program is gone.
 
 All times are in ns by `Mesh.now`: CLOCK_BOOTTIME, which all processes of a host share."""
 

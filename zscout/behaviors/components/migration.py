@@ -1,4 +1,4 @@
-"""A move, as the moving component carries it out: it hands its state and its holds to its successor on standby.
+"""The moving component's side of a move: it hands its state and its holds to its successor, which is on standby.
 
 Until the RCM has the hand-over (without ARCs: until the successor runs) the move can be called off, and the component
 continues here unchanged. After that it stays paused until it learns that the successor runs, or is gone.
