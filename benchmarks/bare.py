@@ -1,8 +1,8 @@
 """The bare cost: a plain Zenoh query, without zscout.
 
 `python -m benchmarks.bare ADDRESS KEY --bytes N` is the other end, a child process (see child.py): a queryable whose
-direct callback sends N bytes. `--answer TEXT` sends TEXT instead; if it begins with an id, the query's id replaces it,
-as clients take no other answer.
+direct callback sends N bytes. `--answer TEXT` sends TEXT instead; if TEXT begins with an id, the query's id replaces
+it, as clients take no other answer.
 """
 
 from __future__ import annotations

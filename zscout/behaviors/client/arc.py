@@ -94,7 +94,7 @@ class Held:
 
     @property
     def upcoming(self) -> list[HoldNotice]:
-        """The waiting request, booking or maintenance to which this hold yields next: one notice for each kind."""
+        """Notices of the waiting request, and of the booking or maintenance, to which this hold yields next."""
         return list(self.arc.upcoming) if self.active else []
 
     async def noticed(self) -> HoldNotice | None:
@@ -216,8 +216,8 @@ class Held:
 
 class Attempt:
     """The context manager of a body under a hold. With `again` it can be entered repeatedly: after a hold was taken
-    away it waits for the next, and after a hold was kept for its minimum runtime it makes a new request. `timeout`:
-    seconds, for each wait."""
+    away it waits for the next; after a hold that had its minimum runtime and was kept until another request waited, it
+    makes a new request. `timeout`: seconds, for each wait."""
 
     def __init__(
         self,

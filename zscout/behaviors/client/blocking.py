@@ -86,7 +86,7 @@ class BlockingHeld:
 
     @property
     def upcoming(self) -> list[HoldNotice]:
-        """The waiting request, booking or maintenance to which this hold yields next: one notice for each kind."""
+        """Notices of the waiting request, and of the booking or maintenance, to which this hold yields next."""
         return self._held.upcoming
 
     def on_notice(self, callback: Callable[[HoldNotice], object]) -> None:

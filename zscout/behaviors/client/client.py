@@ -238,7 +238,7 @@ class Client:
         """Pass one request, queued or running, to the client `to`. Raises RequestRefused."""
         reply = await self._rcm.query(messages.HandOver(id=arc.id, to=str(to)))
         if reply is None or reply.message is None:
-            unknown = Problem("unknown", "the leader did not answer; the request may or may not have passed")
+            unknown = Problem("unknown", "the leader did not answer; the request may or may not have been handed over")
             raise RequestRefused(reply.problem or unknown if reply is not None else unknown)
 
     # Queries
