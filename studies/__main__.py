@@ -25,7 +25,7 @@ STUDIES: Final[dict[str, Study]] = {
     "schedule": Study("scheduling.commands:schedule", "Which strategy uses devices best, and who waits?", "4 min"),
     "bookings": Study("scheduling.commands:bookings", "What do bookings cost, and what do their owners gain?", "2 min"),
     "forecasts": Study("scheduling.commands:forecasts", "How close are predicted start times?", "2 min"),
-    "shares": Study("scheduling.commands:shares", "Are two groups equal, and can one of them cheat?", "3 min"),
+    "shares": Study("scheduling.commands:shares", "Are two groups treated equally, and can one cheat?", "3 min"),
     "traces": Study("scheduling.commands:traces", "How long do the jobs of a real trace wait?", "20 min, a trace"),
     "clairvoyant": Study(
         "scheduling.clairvoyant:clairvoyant", "How much longer than the least do requests wait?", "8 min"

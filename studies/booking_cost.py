@@ -1,9 +1,9 @@
-"""What a booking costs, beside a bare query: `python -m studies booking-cost`.
+"""The cost of a booking, compared with a bare query: `python -m studies booking-cost`.
 
-Two candidates with disks: a booking is told once the other one has it on its disk. Then what a leader of 100 RCs pays
-for 1,000 dates that are booked: a request that is granted at once, and one that a booking keeps out. Last, in processor
-time of the core, 1,000 dates on RCs that vote, each overlapping the next: a takeover with all votes, and what one
-booking, one request or one ballot costs then."""
+Two candidates with disks: a booking is acknowledged once the other candidate has it on its disk. Then the cost of 1,000
+booked dates for a leader of 100 RCs: a request and its release, with and without them. Last, in processor time of the
+core, 1,000 dates on voting RCs, each overlapping the next: a takeover with all votes, and the cost of a booking, a
+request or a ballot."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ from zscout.types import SECOND, Params, Term
 
 HOSTS: Final = ("lead", "other")
 BOOKED: Final = 100
-"""Bookings that stand beside those that are measured."""
+"""Other bookings during the measurement."""
 RCS: Final = 100
 DATES: Final = 1_000
 WARM_UP: Final = 5
@@ -79,7 +79,7 @@ async def on_the_mesh(folder: Path, rounds: int) -> list[Row]:
 
         once: dict[str, Callable[[], Awaitable[object]]] = {
             "book, on another host's disk": book,
-            "unbook, likewise": unbook,
+            "unbook, on another host's disk": unbook,
         }
         often = {f"slots beside {BOOKED} bookings": slots, f"a list of {BOOKED} bookings": listed}
         samples, bare_samples = {name: Samples() for name in (*once, *often)}, Samples()
@@ -97,7 +97,7 @@ async def on_the_mesh(folder: Path, rounds: int) -> list[Row]:
                         samples[name].add(took)
                         bare_samples.add(reference)
     rows = [of_latency("bare query", bare_samples, bare_samples)]
-    return rows + [of_latency(name, one, bare_samples) for name, one in samples.items()]
+    return rows + [of_latency(name, found, bare_samples) for name, found in samples.items()]
 
 
 def in_the_core(rounds: int) -> list[Row]:
@@ -131,7 +131,7 @@ def in_the_core(rounds: int) -> list[Row]:
 
 
 def on_shared_rcs(rounds: int, rcs: int, need: str = "") -> list[Row]:
-    """1,000 dates on this many RCs that vote. `need`: a pattern, of which each date has the RC that is kept for it."""
+    """1,000 dates on this many voting RCs. `need`: a pattern; each date has an RC bound to it."""
     half_hour, day = 1800 * SECOND, 86_400 * SECOND
     params: Params = {"seats": Fraction(1)}
     names = [f"room/r{number}" for number in range(rcs)]
@@ -154,7 +154,7 @@ def on_shared_rcs(rounds: int, rcs: int, need: str = "") -> list[Row]:
         return effects
 
     def settle(effects: list[Effect]) -> None:
-        """All that follows, each ballot in an instant of its own."""
+        """Play all that follows, each ballot in an instant of its own."""
         asked = list[Propose]()
         while True:
             asked += [effect for effect in effects if isinstance(effect, Propose)]
@@ -169,7 +169,7 @@ def on_shared_rcs(rounds: int, rcs: int, need: str = "") -> list[Row]:
 
     ballots = list[float]()
     gc.collect()
-    gc.freeze()  # collections of what others have left are no cost of dates
+    gc.freeze()  # garbage of earlier parts must not count
     dates = tuple(date(number, f"d{number}@0") for number in range(DATES))
     for at in range(0, DATES, 100):
         instant(Dates(dates[at : at + 100], more=True))
@@ -182,10 +182,10 @@ def on_shared_rcs(rounds: int, rcs: int, need: str = "") -> list[Row]:
         Row("its longest instant", 1e3 * entered, "ms", aim=20),
         Row(f"the same, with its {len(ballots)} ballots", 1e3 * spent, "ms"),
     ]
-    one = Samples()
+    votes = Samples()
     for ballot in ballots:
-        one.add(ballot)
-    rows.append(Row(f"one ballot, {on}", 1e3 * one.median, "ms", p99=1e3 * one.p99, aim=5, rounds=len(ballots)))
+        votes.add(ballot)
+    rows.append(Row(f"one ballot, {on}", 1e3 * votes.median, "ms", p99=1e3 * votes.p99, aim=5, rounds=len(ballots)))
     samples = {name: Samples() for name in ("booking", "unbooking", "a request and its release")}
     for number in range(rounds):
         added = replace(date(number, f"a{number}@0"), start=day + number * half_hour // 7)

@@ -1,8 +1,8 @@
-"""`python -m studies building`: what serving a simulated building costs, with real readers on its cameras.
+"""`python -m studies building`: the cost of serving a simulated building, with real readers on its cameras.
 
-The building runs in a process of its own, as `zscout simulate` starts it; its robots' cameras are switched on
-over its serial port, and OpenCV reads the streams here. The processor's time of that process is compared with
-that of the bare pictures: the same robots' pictures, drawn one after the other with nothing around them.
+The building runs as `zscout simulate` in its own process. Its robots' cameras are switched on over its serial port, and
+OpenCV reads the streams here. The processor time of the building's process is compared with the time for only drawing
+the same robots' pictures.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ BAUD = 9600
 
 
 class Reader(threading.Thread):
-    """Reads one camera's stream, as a framegrabber does."""
+    """Reads a camera's stream like a framegrabber."""
 
     def __init__(self, url: str) -> None:
         super().__init__(daemon=True)
@@ -70,19 +70,19 @@ def simulating(building: str, robots: int) -> Iterator[tuple[psutil.Process, dic
 
 
 def measure(building: str, robots: int, seconds: float) -> list[Row]:
-    """Rows for a building with `robots` cameras that are watched, measured over `seconds`."""
+    """Rows for a building with `robots` watched cameras, measured over `seconds`."""
     plan = load_plan(shipped_plans()[building])
     plan_robots = plan.robots[:robots]
     if len(plan_robots) < robots:
         raise SystemExit(f"{building} has {len(plan.robots)} robots; write --robots {len(plan.robots)} or less")
     bare = bare_picture(plan, robots)
     with ExitStack() as stack:
-        process, told = stack.enter_context(simulating(building, robots))
-        port = stack.enter_context(serial.Serial(told["radio"]["port"], BAUD, timeout=1, write_timeout=5))
+        process, output = stack.enter_context(simulating(building, robots))
+        port = stack.enter_context(serial.Serial(output["radio"]["port"], BAUD, timeout=1, write_timeout=5))
         idle = spent(process, 3.0)
         for number, robot in enumerate(plan_robots):
             port.write(encode(CameraPacket(robot.id, 0, number + 1)))
-        readers = [Reader(channel["url"]) for channel in told["channels"]]
+        readers = [Reader(channel["url"]) for channel in output["channels"]]
         for reader in readers:
             reader.start()
             stack.callback(reader.end)
@@ -94,7 +94,7 @@ def measure(building: str, robots: int, seconds: float) -> list[Row]:
     render = statistics.median(bare + again)
     return [
         Row("bare picture, CPU", render * 1e3, "ms", rounds=len(bare + again)),
-        Row("building, nobody watches", idle * 100, "% of a core"),
+        Row("building, no readers", idle * 100, "% of a core"),
         Row(f"building, {robots} cameras watched", busy * 100, "% of a core", aim=AIM if robots == 4 else None),
         Row("frames read", frames / seconds, "frames/s", aim=9.5 * robots, at_least=True),
         Row(
@@ -109,14 +109,14 @@ def measure(building: str, robots: int, seconds: float) -> list[Row]:
 
 
 def keep_moving(port: serial.Serial, plan: Plan, robots: int, number: int) -> None:
-    """Each robot turns on its place, now left, now right, so that no picture is like the last."""
+    """Turn each robot on the spot, alternately left and right, so that all pictures differ."""
     for robot in plan.robots[:robots]:
         wheel = 0.2 if number // 10 % 2 else -0.2
         port.write(encode(DrivePacket(robot.id, number % 256, wheel, -wheel, 1.0)))
 
 
 def spent(process: psutil.Process, seconds: float, meanwhile: Any = None) -> float:
-    """The processor's time of a process, in seconds per second; `meanwhile(n)` is called twice a second."""
+    """The processor time of a process in seconds per second. `meanwhile(n)` is called twice a second."""
     start, begin, number = cpu(process), time.monotonic(), 0
     while time.monotonic() - begin < seconds:
         time.sleep(0.5)
@@ -131,7 +131,7 @@ def cpu(process: psutil.Process) -> float:
 
 
 def bare_picture(plan: Plan, robots: int) -> list[float]:
-    """Seconds of the processor for pictures of the plan's robots, each alone."""
+    """Processor seconds for each single picture of the plan's robots."""
     cv2.setNumThreads(1)
     world, took = World(plan, seed=1), []
     names = [robot.name for robot in plan.robots[:robots]]
@@ -149,7 +149,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m studies building", description=__doc__)
     parser.add_argument("--building", default="living_room", choices=list(shipped_plans()))
     parser.add_argument("--robots", type=int, default=4, choices=range(1, 16), metavar="N")
-    parser.add_argument("--seconds", type=float, default=20.0, help="that are measured (default: 20)")
+    parser.add_argument("--seconds", type=float, default=20.0, help="duration of the measurement (default: 20)")
     parser.add_argument("--json", action="store_true", help="print one JSON object instead of a table")
     args = parser.parse_args()
     rows = measure(args.building, args.robots, args.seconds)

@@ -1,13 +1,12 @@
-"""`python -m studies cdnet FOLDER`: the motion detector beside OpenCV's MOG2 and KNN, by CDnet 2014's protocol.
+"""`python -m studies cdnet FOLDER`: the motion detector compared with OpenCV's MOG2 and KNN, by CDnet 2014's protocol.
 
-FOLDER holds sequences of that data set as they are unpacked: `input/`, `groundtruth/`, `temporalROI.txt` and `ROI.bmp`
-each, in folders of any depth. Nothing of it comes with zscout (changedetection.net; Wang et al., "CDnet 2014: An
-Expanded Change Detection Benchmark Dataset").
+FOLDER holds unpacked sequences of that data set, each with `input/`, `groundtruth/`, `temporalROI.txt` and `ROI.bmp`,
+at any depth. The data set is not part of zscout (changedetection.net; Wang et al., "CDnet 2014: An Expanded Change
+Detection Benchmark Dataset").
 
-Per pixel: within the region of interest and the frames that count; a shadow is background, and what is marked unknown
-or outside does not count. MOG2 and KNN are as OpenCV makes them, their shadows left out, with the usual median filter
-of 5 pixels. Per event: somebody or something comes into the region, and is told within a second; and what is told
-where nothing moved.
+Per pixel: within the region of interest and the counted frames. Shadows are background; pixels marked unknown or
+outside do not count. MOG2 and KNN have OpenCV's defaults, without their shadows, and the usual median filter of 5
+pixels. Per event: reports within a second after a person or thing enters the region, and reports without any motion.
 """
 
 from __future__ import annotations
@@ -30,14 +29,14 @@ from zscout import terminal
 from zscout.behaviors.perception.motion import GAP, RECENT, SMALLEST, SURE, MotionDetector
 
 OUTSIDE, UNKNOWN, MOVING = 85, 170, 255
-"""In the truth's pictures; 0 is background and 50 a shadow."""
+"""Pixel values of the ground truth; 0 is background and 50 a shadow."""
 FOREGROUND: Final = 200
-"""Of what MOG2 and KNN give: 255 moves, 127 is a shadow."""
+"""Threshold for the masks of MOG2 and KNN: 255 moves, 127 is a shadow."""
 MEDIAN: Final = 5
 
 Picture = NDArray[np.uint8]
 Watch = Callable[[float, Picture], tuple[Picture, bool]]
-"""Time and picture in; which pixels move (above 0), and whether it tells of motion."""
+"""A function of time and picture. Returns a mask of moving pixels (above 0), and True if it reports motion."""
 
 
 def ours() -> Watch:
@@ -51,14 +50,14 @@ def ours() -> Watch:
 
 
 def opencv(subtractor: Any) -> Watch:
-    lately: deque[bool] = deque(maxlen=RECENT)
+    recent: deque[bool] = deque(maxlen=RECENT)
 
     def see(_: float, picture: Picture) -> tuple[Picture, bool]:
         mask = cv2.medianBlur(subtractor.apply(picture), MEDIAN)
         moving = np.asarray(cv2.threshold(mask, FOREGROUND, 255, cv2.THRESH_BINARY)[1], np.uint8)
         areas = cv2.connectedComponentsWithStats(moving)[2][1:, cv2.CC_STAT_AREA]
-        lately.append(bool(areas.size) and bool(areas.max() >= SMALLEST * moving.size))
-        return moving, sum(lately) >= SURE
+        recent.append(bool(areas.size) and bool(areas.max() >= SMALLEST * moving.size))
+        return moving, sum(recent) >= SURE
 
     return see
 
@@ -72,7 +71,7 @@ METHODS: Final[Mapping[str, Callable[[], Watch]]] = {
 
 @dataclass(frozen=True, slots=True)
 class Score:
-    """Of one method in one sequence."""
+    """The score of a method in a sequence."""
 
     sequence: str
     method: str
@@ -80,11 +79,11 @@ class Score:
     precision: float
     f: float
     milliseconds: float
-    """Of a processor, for a picture."""
+    """Processor time per picture."""
     events: int
     in_time: int
     false: int
-    """Spells of motion that nothing moved in."""
+    """Spells of reported motion in which nothing moved."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,25 +91,25 @@ class Sequence:
     folder: Path
 
     def frames(self) -> Iterator[tuple[int, Picture, Picture]]:
-        """Number, picture and truth, from the first."""
+        """Yield number, picture and truth of all frames in order."""
         for path in sorted((self.folder / "input").glob("in*.jpg")):
             number = path.stem.removeprefix("in")
             picture = cv2.imread(str(path))
             truth = cv2.imread(str(self.folder / "groundtruth" / f"gt{number}.png"), cv2.IMREAD_GRAYSCALE)
             if picture is None or truth is None:
-                raise SystemExit(f"{path}: no picture with its groundtruth; unpack the sequence anew")
+                raise SystemExit(f"{path}: no picture with its groundtruth; unpack the sequence again")
             yield int(number), np.asarray(picture, np.uint8), np.asarray(truth, np.uint8)
 
     @property
     def counted(self) -> tuple[int, int]:
-        """The first and the last frame that count."""
+        """The first and the last counted frame."""
         first, last = (self.folder / "temporalROI.txt").read_text(encoding="ascii").split()
         return int(first), int(last)
 
     def region(self) -> NDArray[np.bool_]:
         found = cv2.imread(str(self.folder / "ROI.bmp"), cv2.IMREAD_GRAYSCALE)
         if found is None:
-            raise SystemExit(f"{self.folder / 'ROI.bmp'}: no picture; unpack the sequence anew")
+            raise SystemExit(f"{self.folder / 'ROI.bmp'}: no picture; unpack the sequence again")
         return np.asarray(found) > 0
 
 
@@ -118,7 +117,7 @@ def score(sequence: Sequence, method: str, rate: float) -> Score:
     watch, region, (first, last) = METHODS[method](), sequence.region(), sequence.counted
     hits = misses = wrong = pictures = 0
     took = 0.0
-    told, there = list[tuple[float, bool]](), list[tuple[float, bool]]()
+    reported, there = list[tuple[float, bool]](), list[tuple[float, bool]]()
     for number, picture, truth in sequence.frames():
         began = time.process_time()
         mask, moves = watch(number / rate, picture)
@@ -131,12 +130,12 @@ def score(sequence: Sequence, method: str, rate: float) -> Score:
         hits += int(np.count_nonzero(found & moving))
         misses += int(np.count_nonzero(moving & ~found))
         wrong += int(np.count_nonzero(counts & found & ~moving))
-        told.append((number / rate, moves))
+        reported.append((number / rate, moves))
         there.append((number / rate, np.count_nonzero(moving) >= SMALLEST * region.sum()))
     recall, precision = hits / max(1, hits + misses), hits / max(1, hits + wrong)
     f = 2 * recall * precision / max(1e-9, recall + precision)
-    events, alarms = spells(there), spells(told)
-    in_time = sum(any(begin <= at <= begin + IN_TIME and moves for at, moves in told) for begin, _ in events)
+    events, alarms = spells(there), spells(reported)
+    in_time = sum(any(begin <= at <= begin + IN_TIME and moves for at, moves in reported) for begin, _ in events)
     false = sum(not any(begin <= end + CLEAR and stop >= start for start, end in events) for begin, stop in alarms)
     return Score(
         sequence.folder.name, method, recall, precision, f, 1e3 * took / max(1, pictures), len(events), in_time, false
@@ -144,7 +143,7 @@ def score(sequence: Sequence, method: str, rate: float) -> Score:
 
 
 def spells(seen: list[tuple[float, bool]]) -> list[tuple[float, float]]:
-    """Begin and end of each time that something moves, with pauses of less than GAP."""
+    """Begin and end of each spell of motion, which may have pauses of at most GAP."""
     found = list[tuple[float, float]]()
     for at, moves in seen:
         if moves and found and at - found[-1][1] <= GAP:
@@ -163,22 +162,22 @@ def main() -> None:
     sequences = [Sequence(path.parent) for path in sorted(args.folder.rglob("temporalROI.txt"))]
     if not sequences or args.rate <= 0:
         parser.error(f"{args.folder} has no sequence of CDnet 2014 (temporalROI.txt), or the rate is not above 0")
-    # What one picture costs, not how many processors there are.
+    # Measure the cost of a picture on one processor.
     cv2.setNumThreads(1)
     scores = [score(sequence, method, args.rate) for sequence in sequences for method in METHODS]
     if args.json:
-        print(json.dumps([asdict(one) for one in scores]))
+        print(json.dumps([asdict(score) for score in scores]))
         return
     cells = [
         [
-            one.sequence,
-            one.method,
-            *(f"{value:.3f}" for value in (one.recall, one.precision, one.f)),
-            f"{one.milliseconds:.2f} ms",
-            f"{one.in_time} of {one.events}",
-            str(one.false),
+            row.sequence,
+            row.method,
+            *(f"{value:.3f}" for value in (row.recall, row.precision, row.f)),
+            f"{row.milliseconds:.2f} ms",
+            f"{row.in_time} of {row.events}",
+            str(row.false),
         ]
-        for one in scores
+        for row in scores
     ]
-    heads = ["sequence", "method", "recall", "precision", "F", "a picture", "told in 1 s", "false"]
+    heads = ["sequence", "method", "recall", "precision", "F", "a picture", "reported in 1 s", "false"]
     terminal.print_table(heads, cells)

@@ -90,11 +90,11 @@ class Chromium:
                     raise RuntimeError(f"chromium ended with code {self._process.wait()}")
                 self._read += got
             message, _, self._read = self._read.partition(b"\0")
-            told = json.loads(message)
-            if told.get("id") == number:
-                if "error" in told:
-                    raise RuntimeError(f"{method}: {told['error']}")
-                return told["result"]
+            answer = json.loads(message)
+            if answer.get("id") == number:
+                if "error" in answer:
+                    raise RuntimeError(f"{method}: {answer['error']}")
+                return answer["result"]
 
     def picture(self) -> Image.Image:
         deadline = time.monotonic() + ANSWER

@@ -1,4 +1,4 @@
-"""A node that can be asked how many load reports its balancer has taken in, and what it has used itself.
+"""A node that reports the number of load reports that its balancer received, and its own resource use.
 
 `python -m studies.counted_node NODE_FILE` is a child process (see child.py): a `zscout-node` that counts.
 """
@@ -24,7 +24,7 @@ from zscout.placement.balancer import Balancer
 
 
 class Count:
-    """How often a method was called."""
+    """Counts the calls of a method."""
 
     def __init__(self) -> None:
         self.calls = 0
@@ -46,8 +46,8 @@ async def main(file: Path) -> None:
     ready()
     while await asyncio.to_thread(sys.stdin.readline):
         spent = process.cpu_times()
-        told = {"reports": count.calls, "cpu": spent.user + spent.system, "memory": process.memory_info().rss}
-        print(json.dumps(told), flush=True)
+        counts = {"reports": count.calls, "cpu": spent.user + spent.system, "memory": process.memory_info().rss}
+        print(json.dumps(counts), flush=True)
     stop.set()
     await task
 

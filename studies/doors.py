@@ -1,9 +1,8 @@
-"""`python -m studies doors`: what closed doors cost, and what is left of what a stranger did at open ones.
+"""`python -m studies doors`: the cost of certificates, and the damage that a stranger does to an open fleet.
 
-The fleet with certificates (TLS, and access rules of 20 names) and the plain one take turns, on one machine. The
-stranger sends 400 MB in one message, and leads in a term of 10^12 while a fleet begins and a node of it starts anew.
-Members flood a fleet with certificates, as far as their roles allow, while another asks.
-"""
+A fleet with certificates (TLS, and access rules with 20 names) and a plain fleet take turns on one machine. A stranger
+sends 400 MB in one message, and leads in term 10^12 while a fleet starts and a node restarts. Members flood a fleet
+with certificates, as far as their roles allow, while another client asks."""
 
 from __future__ import annotations
 
@@ -43,7 +42,7 @@ WARM = 5
 
 
 async def entered(client: Client, rc: str = "radio/a") -> float:
-    """Seconds from a request to its body."""
+    """Seconds from a request to the beginning of its body."""
     start = time.perf_counter()
     took = 0.0
     async with hold(client, "bench", {rc: {}}):
@@ -60,7 +59,7 @@ async def asked(client: Client) -> float:
 
 
 async def cost(folder: Path, rounds: int) -> list[Row]:
-    """The same in a fleet with certificates and in one without, in turn."""
+    """Measure a fleet with certificates and a plain fleet in turn."""
     more = [f"more{number}" for number in range(NAMES - 7)]
     roles = ROLES.replace('viewer = ["wall"]', f'viewer = ["wall", {", ".join(map(repr, more))}]')
     (folder / "closed").mkdir()
@@ -91,7 +90,7 @@ async def cost(folder: Path, rounds: int) -> list[Row]:
 
 
 async def beside_floods(folder: Path, rounds: int) -> list[Row]:
-    """500 questions and asks of three members are outstanding all the time, made on the same machine."""
+    """Measure while 500 queries and requests of three members are outstanding all the time, on the same machine."""
     alone, beside = Samples(), Samples()
     async with ClosedLab(folder) as lab:
         lab.node("anvil", "robot/a", "robot/b")
@@ -109,7 +108,7 @@ async def beside_floods(folder: Path, rounds: int) -> list[Row]:
 
 
 async def huge_message(folder: Path) -> list[Row]:
-    """Memory and the longest silence of a node that is sent 400 MB."""
+    """Memory and longest silence of a node that receives 400 MB."""
     async with Lab(folder) as lab:
         node = lab.node("anvil", "robot/a")
         client = await lab.client()
@@ -135,7 +134,7 @@ async def huge_message(folder: Path) -> list[Row]:
 
 
 async def mad_term(folder: Path, rounds: int) -> list[Row]:
-    """From the end of a leader in a term of 10^12 to the first grant."""
+    """Time from the end of a leader in term 10^12 to the first grant."""
     took = Samples()
     for number in range(rounds):
         (folder / str(number)).mkdir()
@@ -171,7 +170,7 @@ async def measure(rounds: int, mad: int) -> list[Row]:
 def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m studies doors", description=__doc__)
     parser.add_argument("--rounds", type=int, default=200, help="of each latency (default: 200)")
-    parser.add_argument("--mad", type=int, default=5, help="fleets that begin beside a mad leader (default: 5)")
+    parser.add_argument("--mad", type=int, default=5, help="fleets that start beside a mad leader (default: 5)")
     args = parser.parse_args()
     before = os.getloadavg()[0]
     print(table(run(measure(args.rounds, args.mad))))

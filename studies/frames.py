@@ -1,11 +1,10 @@
-"""`python -m studies frames`: from a robot's picture to the motor command that follows from it, through
-the mesh, and what a robot's behavior costs.
+"""`python -m studies frames`: the time from a robot's picture to the resulting motor command, through the mesh, and the
+cost of a robot's behavior.
 
-The building and the node with its devices are processes, as is each robot's `place_robot`. The radio's line
-goes through this process: it notes when a packet's bytes came out of the driver's pty, and hands them on. A
-picture's time is the one at which the framegrabber had read it. A drive packet follows from its robot's
-newest picture then, or from the one before, if a command had already followed from that.
-"""
+The building, the node with its devices, and each robot's `place_robot` are separate processes. The radio's line goes
+through this process: it notes when a packet's bytes come out of the driver's pty, and forwards them. A picture's time
+is when the framegrabber had read it. A drive packet results from its robot's newest picture, or from the picture before
+if the newest already had a command."""
 
 from __future__ import annotations
 
@@ -41,15 +40,15 @@ BUILDING: Final = "living_room"
 ROBOTS: Final = (33, 35, 37, 39)
 FRAME_RATE: Final = 10.0
 BAUD: Final = 115_200
-"""The line's own time, 1.5 ms for two packets, is not to count."""
+"""Fast, so that the line's own time (1.5 ms for two packets) is negligible."""
 COMMAND_RATE: Final = 20
 """Above the frame rate: no command waits for its share of the radio."""
 AIM: Final = 0.25
-"""Of the frame interval, for the median."""
+"""Aim for the median, as a part of the frame interval."""
 
 
 class Tap:
-    """The radio's line: what comes out of the driver's pty, when, and on to the building's."""
+    """The radio's line: bytes from the driver's pty are noted with their times, and forwarded to the building's."""
 
     def __init__(self, port: str) -> None:
         self._master, slave = os.openpty()
@@ -59,11 +58,11 @@ class Tap:
         self._decoder = PacketDecoder()
         self.port = os.ttyname(slave)
         self.drives: list[tuple[float, int]] = []
-        """When, in seconds, and to which robot."""
+        """Drive packets: time in seconds, and robot."""
 
     def _read(self) -> None:
         now, data = clock.now() / SECOND, os.read(self._master, 4_096)
-        self.drives += [(now, one.robot) for one in self._decoder.feed(data) if isinstance(one, DrivePacket)]
+        self.drives += [(now, packet.robot) for packet in self._decoder.feed(data) if isinstance(packet, DrivePacket)]
         os.write(self._building, data)
 
     def __enter__(self) -> Self:
@@ -79,7 +78,7 @@ class Tap:
 
 
 class Pictures:
-    """When the pictures of each robot were read."""
+    """The times when each robot's pictures were read."""
 
     def __init__(self, lab: Lab, client: Client, count: int) -> None:
         self._lab, self._client = lab, client
@@ -108,11 +107,11 @@ class Pictures:
 
 
 def latencies(pictures: list[float], drives: list[float]) -> list[float]:
-    """Seconds from a picture to the drive packet that followed from it, for each packet. Both in order."""
+    """Seconds from a picture to the resulting drive packet, for each packet. Both lists are in order."""
     found, used = [], -1
     for at in drives:
         newest = bisect.bisect_left(pictures, at) - 1
-        # A mind acts once on a picture: where the newest has had its command, this one was late.
+        # A behavior acts once on a picture: if the newest already had its command, this packet was late.
         number = newest - 1 if newest == used else newest
         if number >= 0:
             found.append(at - pictures[number])
@@ -122,7 +121,7 @@ def latencies(pictures: list[float], drives: list[float]) -> list[float]:
 
 @asynccontextmanager
 async def building(folder: Path, robots: int) -> AsyncIterator[tuple[dict[str, Any], str]]:
-    """What `zscout simulate` told, and the node file that it wrote."""
+    """The output of `zscout simulate`, and the node file that it wrote."""
     node = folder / "devices.toml"
     command = [sys.executable, "-m", "zscout.cli.main", "simulate", BUILDING, "--json", "--seed", "1"]
     command += ["--baud", str(BAUD), "--channels", str(robots), "--framegrabbers", str(robots)]
@@ -130,8 +129,8 @@ async def building(folder: Path, robots: int) -> AsyncIterator[tuple[dict[str, A
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)  # noqa: ASYNC220 - it is a moment
     assert process.stdout is not None
     try:
-        told = json.loads(await asyncio.to_thread(process.stdout.readline))
-        yield told, node.read_text()
+        output = json.loads(await asyncio.to_thread(process.stdout.readline))
+        yield output, node.read_text()
     finally:
         process.terminate()
         await asyncio.to_thread(process.wait)
@@ -139,12 +138,12 @@ async def building(folder: Path, robots: int) -> AsyncIterator[tuple[dict[str, A
 
 
 async def of_robots(folder: Path, robots: int, seconds: float) -> list[Row]:
-    """Rows for so many robots at once, measured over `seconds`."""
+    """Rows for this number of robots at once, measured over `seconds`."""
     ids = ROBOTS[:robots]
-    async with building(folder, robots) as (told, devices), Lab(folder) as lab:
-        with Tap(told["radio"]["port"]) as tap:
+    async with building(folder, robots) as (output, devices), Lab(folder) as lab:
+        with Tap(output["radio"]["port"]) as tap:
             tables = devices.partition("[[rc]]")[2]
-            lab.node("lab", extra=f"[[rc]]{tables}".replace(told["radio"]["port"], tap.port))
+            lab.node("lab", extra=f"[[rc]]{tables}".replace(output["radio"]["port"], tap.port))
             client = await lab.client()
             placing = Placing(client)
             await lab.ready(client, "radio/rf0", f"framegrabber/fgrab{robots}", f"robot/scout{ids[-1]}")
@@ -196,7 +195,7 @@ def rows_of(robots: int, samples: Samples, rate: float, shares: list[float]) -> 
 
 
 def spent(processes: list[psutil.Process]) -> float:
-    """The processor's time of all of them, in seconds."""
+    """The processor time of all processes, in seconds."""
     total = 0.0
     for process in processes:
         with suppress(psutil.NoSuchProcess):
@@ -206,7 +205,7 @@ def spent(processes: list[psutil.Process]) -> float:
 
 
 async def measure(seconds: float, progress: Callable[[str], None], counts: tuple[int, ...] = (1, 2, 4)) -> list[Row]:
-    """All rows; `progress` is told what is measured next."""
+    """All rows. `progress` is called with the name of the next measurement."""
     rows: list[Row] = []
     for robots in counts:
         progress(f"pictures to motor commands: {robots} of {len(ROBOTS)} robots")
@@ -217,8 +216,8 @@ async def measure(seconds: float, progress: Callable[[str], None], counts: tuple
 
 def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m studies frames", description=__doc__)
-    parser.add_argument("--robots", type=int, choices=(1, 2, 3, 4), help="only so many (default: 1, 2 and 4)")
-    parser.add_argument("--seconds", type=float, default=30.0, help="that are measured (default: 30)")
+    parser.add_argument("--robots", type=int, choices=(1, 2, 3, 4), help="only this number (default: 1, 2 and 4)")
+    parser.add_argument("--seconds", type=float, default=30.0, help="duration of a measurement (default: 30)")
     parser.add_argument("--json", action="store_true", help="print one JSON object instead of a table")
     args = parser.parse_args()
     load = os.getloadavg()[0]

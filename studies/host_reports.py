@@ -1,7 +1,7 @@
 """Many hosts that report their load once a second, each on its own key, over a few sessions.
 
-`python -m studies.host_reports FLEET_FILE HOSTS` is a child process (see child.py). Told to start, it
-reports at even paces; told to stop, it says how many reports it has sent.
+`python -m studies.host_reports FLEET_FILE HOSTS` is a child process (see child.py). On `start` it reports at an even
+pace; on `stop` it prints the number of sent reports.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from zscout.messages import ComponentUse, LoadReport
 
 SESSIONS = 4
 STEP = 0.01
-"""Seconds from one handful of reports to the next."""
+"""Seconds between two batches of reports."""
 MOST = 500
-"""Reports in one go."""
+"""Largest batch of reports."""
 COMPONENTS = 4
 """On each host."""
 KINDS = ("camera", "servo", "watcher", "planner")
@@ -33,7 +33,7 @@ GIGABYTE = 1_000_000_000
 
 
 class Host:
-    """One host whose load wanders."""
+    """A host with a random walk as load."""
 
     def __init__(self, name: str, publisher: Publisher, rng: random.Random) -> None:
         self._name, self._publisher, self._rng = name, publisher, rng
@@ -66,8 +66,8 @@ class Host:
 
 
 async def reports(hosts: list[Host], stop: asyncio.Event) -> int:
-    """Each host once a second, evenly apart, until `stop`; what was held up is made up for, but not by more
-    than MOST at once: a machine that is too slow for so many sends fewer. Counts them."""
+    """Report for each host once a second, evenly spaced, until `stop`. Return the number of reports. Late reports are
+    caught up, but at most MOST at once, so that a machine that is too slow sends fewer."""
     loop = asyncio.get_running_loop()
     start, sent = loop.time(), 0
     while not stop.is_set():

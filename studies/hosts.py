@@ -1,8 +1,8 @@
-"""`python -m studies hosts`: one balancer and the reports of many hosts, as ratios to a bare query.
+"""`python -m studies hosts`: a balancer with the reports of many hosts, as ratios to a bare query.
 
-The hosts are simulated, their reports are not: each has its own key and is published once a second by real
-sessions; one node leads, and its balancer is asked for the best of all hosts. The number is doubled until
-answers take longer than END bare queries or reports are lost.
+The hosts are simulated, but their reports are real: each has its own key and is published once a second by real
+sessions. A node leads, and its balancer is asked for the best of all hosts. The number of hosts is doubled until
+answers take longer than END bare queries, or reports are lost.
 """
 
 from __future__ import annotations
@@ -35,26 +35,26 @@ from zscout.messages import HostRanking, RankAsk, RankedHost
 from zscout.placement.balancer import MAX_HOSTS
 
 HOT = 3
-"""Times that each thing is done in a row, of which the last counts, as in latency.py."""
+"""Number of repetitions in a row, of which the last counts, as in latency.py."""
 PAUSE = 0.03
-"""Seconds between two rounds at most: they come at any moment of what the node does."""
+"""Longest pause in seconds between two rounds, so that they come at random moments of the node's work."""
 END = 10.0
 QUIET, ASKED = 4.0, 8.0
-"""Seconds in which nobody asks the balancer, and in which it is asked."""
+"""Seconds without queries to the balancer, and seconds with queries."""
 MEGA = 1e6
 ANSWER = HostRanking([RankedHost(f"host{n}", 0.5, "x" * 75) for n in range(RankAsk().at_most)], "composite", "as asked")
-"""As long as an answer is."""
+"""A typical answer, for its length."""
 
 
 @dataclass(frozen=True)
 class Figures:
-    """Of one number of hosts; seconds, bytes, shares of one core."""
+    """Figures for one number of hosts, in seconds, bytes, and shares of one core."""
 
     hosts: int
     idle: float
-    """CPU before they were there."""
+    """CPU before there were hosts."""
     cpu: float
-    """CPU while they report and nobody asks."""
+    """CPU while hosts report, without queries."""
     memory_before: int
     memory: int
     bare: float
@@ -75,30 +75,30 @@ class Figures:
 
 
 class Node:
-    """The node that leads, and what it says of itself."""
+    """The leading node, and its counts of itself."""
 
     def __init__(self, process: Child) -> None:
         self._process = process
 
-    async def told(self) -> dict[str, Any]:
+    async def counts(self) -> dict[str, Any]:
         self._process.order({})
-        told: dict[str, Any] = await asyncio.to_thread(self._process.report)
-        return told
+        counts: dict[str, Any] = await asyncio.to_thread(self._process.report)
+        return counts
 
     async def share(self, seconds: float) -> float:
-        """Its part of a core over so long."""
-        before, start = await self.told(), time.monotonic()
+        """Its share of a core over `seconds`."""
+        before, start = await self.counts(), time.monotonic()
         await asyncio.sleep(seconds)
-        spent = (await self.told())["cpu"] - before["cpu"]
+        spent = (await self.counts())["cpu"] - before["cpu"]
         return float(spent / (time.monotonic() - start))
 
     async def settled(self, reports: int) -> int:
-        """How many reports it has taken in, once it is all of them or no more come."""
+        """The number of received reports, when it has all of them or no more arrive."""
         last, now = -1, 0
         while last < now < reports:
             last = now
             await asyncio.sleep(1)
-            now = (await self.told())["reports"]
+            now = (await self.counts())["reports"]
         return now
 
 
@@ -108,7 +108,7 @@ async def rank(client: Client) -> HostRanking | None:
 
 
 async def ranked(client: Client, hosts: int) -> None:
-    """Waits until all hosts are ranked."""
+    """Wait until all hosts are ranked."""
     async with asyncio.timeout(HANG):
         while True:
             answer = await rank(client)
@@ -118,7 +118,7 @@ async def ranked(client: Client, hosts: int) -> None:
 
 
 async def measure(folder: Path, hosts: int, quiet: float = QUIET, asked: float = ASKED) -> Figures:
-    """One node and so many hosts."""
+    """Measure a node with this number of hosts."""
     with ExitStack() as stack:
         lab = Lab(folder, candidates=["lead"])
         file = folder / "lead.toml"
@@ -133,7 +133,7 @@ async def measure(folder: Path, hosts: int, quiet: float = QUIET, asked: float =
         async with lab:
             client = await lab.client("asker")
             await lab.ready(client)
-            before = await node.told()
+            before = await node.counts()
             idle = await node.share(quiet / 2)
             files = str(lab.fleet_file), str(hosts)
             reporters = await asyncio.to_thread(stack.enter_context, child("host_reports", *files))
@@ -154,10 +154,10 @@ async def measure(folder: Path, hosts: int, quiet: float = QUIET, asked: float =
                 bares.add(reference)
                 answers.add(took)
                 await asyncio.sleep(random.uniform(0, PAUSE))  # noqa: S311
-            memory = (await node.told())["memory"]
+            memory = (await node.counts())["memory"]
             reporters.order({"do": "stop"})
             sent = await asyncio.to_thread(reporters.report)
-            heard = await node.settled(sent)
+            received = await node.settled(sent)
     return Figures(
         hosts=hosts,
         idle=idle,
@@ -170,22 +170,22 @@ async def measure(folder: Path, hosts: int, quiet: float = QUIET, asked: float =
         bare_p99=bares.p99,
         rounds=len(answers.values),
         sent=sent,
-        missed=sent - heard,
+        missed=sent - received,
     )
 
 
 def table(all_found: list[Figures]) -> str:
     times_of, rest = ("answer", "p99", "bare", "p99"), f"{'ratio':>8}{'p99':>8}{'node CPU':>10}{'RSS':>8}"
     lines = [f"{'hosts':>7}" + "".join(f"{name:>10}" for name in times_of) + rest + f"{'sent':>9}{'missed':>8}"]
-    for one in all_found:
-        times = "".join(f"{t * 1e3:>7.2f} ms" for t in (one.answer, one.answer_p99, one.bare, one.bare_p99))
-        ratios = f"{one.ratio:>8.1f}{one.answer_p99 / one.bare_p99:>8.1f}"
-        use = f"{one.cpu:>9.1%} {one.memory / MEGA:>4.0f} MB"
-        lines.append(f"{one.hosts:>7,}{times}{ratios}{use}{one.sent:>9,}{one.missed:>8,}")
+    for point in all_found:
+        times = "".join(f"{t * 1e3:>7.2f} ms" for t in (point.answer, point.answer_p99, point.bare, point.bare_p99))
+        ratios = f"{point.ratio:>8.1f}{point.answer_p99 / point.bare_p99:>8.1f}"
+        use = f"{point.cpu:>9.1%} {point.memory / MEGA:>4.0f} MB"
+        lines.append(f"{point.hosts:>7,}{times}{ratios}{use}{point.sent:>9,}{point.missed:>8,}")
     first = all_found[0]
     lines.append(
         f"\nBefore there were hosts the node used {first.idle:.1%} of a core and "
-        f"{first.memory_before / MEGA:.0f} MB. Node CPU is that while nobody asks;"
+        f"{first.memory_before / MEGA:.0f} MB. Node CPU is without queries;"
         "\nratios are to the bare query's median and p99."
     )
     last = all_found[-1]
@@ -198,10 +198,10 @@ def table(all_found: list[Figures]) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m studies hosts", description=__doc__)
     parser.add_argument("--json", action="store_true", help="print one JSON object instead of a table")
-    parser.add_argument("--hosts", type=int, help="only so many (default: 1,000, doubled until it ends)")
+    parser.add_argument("--hosts", type=int, help="only this number (default: 1,000, doubled until answers are slow)")
     args = parser.parse_args()
     if args.hosts is not None and not 1 <= args.hosts <= MAX_HOSTS:
-        parser.error(f"--hosts: {args.hosts} is not from 1 to {MAX_HOSTS}, which is all that a balancer takes")
+        parser.error(f"--hosts: {args.hosts} is not from 1 to {MAX_HOSTS}, the limit of a balancer")
     found: list[Figures] = []
     hosts = args.hosts or 1_000
     while True:
@@ -219,7 +219,7 @@ def main() -> None:
         sys.exit(1)
     if args.json:
         machine = {"cores": os.cpu_count(), "python": platform.python_version()}
-        points = [asdict(one) | {"ratio": one.ratio, "ended": one.ended} for one in found]
+        points = [asdict(point) | {"ratio": point.ratio, "ended": point.ended} for point in found]
         print(json.dumps({"machine": machine, "hosts": points}, indent=2))
         return
     print(table(found))

@@ -1,10 +1,10 @@
-"""Hosts whose interfaces come and go: how long until the fleet is whole again, and which holds feel it.
+"""Hosts with interfaces that come and go: the time until the fleet is whole again, and the disturbed holds.
 
     python -m studies interfaces --cycles 20 --way connect      (needs root, network namespaces, iproute2)
 
-A program on each of two hosts holds a device of its own host. Host a, which leads, has its address changed, begins
-before its cable is there, is given another interface, or loses all and gets them back. A hold need not be lost where
-the leader is on the host of holder and device, too. Exit code 0: none of these was; 1: else; 2: it can't run here."""
+A program on each of two hosts holds a device of its own host. Host a, which leads, has its address changed, starts
+before its cable is plugged in, gets another interface, or loses all and gets them back. A hold whose holder and device
+are on the leader's host need not be lost. Exit code 0: no such hold was lost; 1: one was; 2: it can't run here."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ from studies.sites import Program, present
 from tests.live.closed import make_keys
 
 HOSTS: Final = {"a": "lan", "b": "lan", "d": "other"}
-"""By host the network that it is on; d is seen by whom has an interface there, too."""
+"""The network of each host. Hosts with a second interface in the network of d see it."""
 CANDIDATES: Final = ("a", "b")
 Change: TypeAlias = Literal["address", "cable", "added", "gone"]
 CHANGES: Final[tuple[Change, ...]] = ("added", "address", "cable", "gone")
-"""In this order: a leads at first, and a leader on host b would not see d."""
+"""In this order, because a leads at first, and a leader on host b would not see d."""
 Way: TypeAlias = Literal["multicast", "connect"]
 DOWN: Final = 6.0
 """Seconds without a network: the other host leads by then."""
@@ -74,7 +74,7 @@ class Net:
             self.name(host, "eth0", self.addresses[host])
 
     def plug(self, host: str, card: str, lan: str) -> None:
-        """Gives a host a new interface, with its cable."""
+        """Add an interface with its cable to a host."""
         inner = ("peer", "name", card, "netns", self.space(host))
         self.on(lan, "link", "add", f"{host}{card}", "type", "veth", *inner)
         self.on(lan, "link", "set", f"{host}{card}", "master", "lan", "up")
@@ -88,7 +88,7 @@ class Net:
         self.on(host, "route", "replace", "224.0.0.0/4", "dev", card)
 
     def rename(self, host: str) -> None:
-        """Another address in the place of its address."""
+        """Replace the host's address by a new address."""
         old = self.addresses[host]
         self.addresses[host] = new = f"{old.rpartition('.')[0]}.{next(self._numbers)}"
         self.on(host, "addr", "del", f"{old}/24", "dev", "eth0")
@@ -145,7 +145,7 @@ class Fleet:
         self.processes.start(host, [sys.executable, "-m", "zscout.node", str(self.folder / f"{host}.toml")])
 
     async def begins(self, host: str) -> None:
-        """Starts the program of a host; it holds the device of its own host."""
+        """Start the program of a host, which holds the device of its host."""
         env = {name: value for name, value in os.environ.items() if not name.startswith("ZSCOUT_")}
         with (self.folder / f"program-{host}.log").open("ab") as log:
             process = await asyncio.create_subprocess_exec(
@@ -168,7 +168,7 @@ class Fleet:
         await asyncio.to_thread(self.processes.kill, host)
 
     async def works_on(self, host: str) -> list[dict[str, Any]]:
-        """Waits until the device of a program has obeyed once more; returns the trouble that it had until then."""
+        """Wait until the device of a program has obeyed once more. Return its trouble until then."""
         program, until = self.programs[host], time.monotonic() + DOWN
         while not (found := await program.trouble()) and not program.beats:
             if time.monotonic() > until:
@@ -176,7 +176,7 @@ class Fleet:
         return [{"had": program.grant, **event} for event in found]
 
     async def whole(self, rcs: Collection[str], hosts: Sequence[str] = CANDIDATES, within: float = 30.0) -> str:
-        """Waits until the programs of these hosts see one leader, who has these devices; returns the leader's host."""
+        """Wait until the programs of these hosts see the same leader with these devices. Return the leader's host."""
         async with asyncio.timeout(within):
             while True:
                 states = await asyncio.gather(*(self.programs[host].state() for host in hosts))
@@ -201,7 +201,7 @@ class Cycle(NamedTuple):
 
 
 async def cycle(fleet: Fleet, change: Change) -> Cycle:
-    """One change at host a, from a whole fleet to a whole fleet."""
+    """A change at host a, from a whole fleet to a whole fleet."""
     rcs, hosts = {"cam/a", "cam/b"}, list(CANDIDATES)
     leads = "" if change == "added" else await fleet.whole(rcs)
     match change:
@@ -249,20 +249,22 @@ async def cycle(fleet: Fleet, change: Change) -> Cycle:
 
 
 async def measure(asked: argparse.Namespace, folder: Path) -> bool:
-    """Prints what it finds. Returns whether no hold was lost."""
+    """Print the results. Return True if no hold beside its leader was lost."""
     found: list[Cycle] = []
     async with Fleet(folder, asked.way, secured=asked.secured) as fleet:
         await fleet.whole({"cam/a", "cam/b"})
         for change in asked.only or CHANGES:
             for number in range(asked.cycles):
-                one = await cycle(fleet, change)
-                found.append(one)
-                what = f"LOST: {one.trouble}" if one.trouble else "no hold lost"
-                print(f"{asked.way:9}  {change:7}  {number + 1:3}  whole after {one.took:5.2f} s, {what}", flush=True)
+                result = await cycle(fleet, change)
+                found.append(result)
+                what = f"LOST: {result.trouble}" if result.trouble else "no hold lost"
+                print(
+                    f"{asked.way:9}  {change:7}  {number + 1:3}  whole after {result.took:5.2f} s, {what}", flush=True
+                )
     for change in asked.only or CHANGES:
-        took = [one.took for one in found if one.change == change]
+        took = [result.took for result in found if result.change == change]
         print(f"{asked.way} {change}: median {median(took):.2f} s, at most {max(took):.2f} s ({len(took)})")
-    needless = sum(one.needless for one in found)
+    needless = sum(result.needless for result in found)
     print(f"{asked.way}: {needless} of {len(found)} cycles cost a hold beside its leader")
     return not needless
 

@@ -1,7 +1,7 @@
-"""`python -m studies journal`: what a journal of 100,000 holds costs: its commits, its file, its answers.
+"""`python -m studies journal`: the cost of a journal of 100,000 holds: its commits, its file, its answers.
 
-Each hold comes as two publications, its grant and its end, of two RCs, which tell for how long they were used; commits
-have as many as a second of a busy fleet gives. Answers are timed with their encoding, as a candidate gives them."""
+Each hold has two publications, its grant and its end, and two RCs, which report how long they were used. A commit has
+as many holds as a second of a busy fleet. Answers are timed with their encoding, as by a candidate."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ HOLDS = 100_000
 PER_COMMIT = 100
 """Holds that begin and end between two commits."""
 APART = 60.0
-"""Seconds from one hold to the next: three months in all, about."""
+"""Seconds between holds: about three months in all."""
 TERM = Term(1, "0123456789ab")
 START = 1_700_000_000.0
 SIZE = 10**9
@@ -30,7 +30,7 @@ AGE = 3.2e7
 
 
 def publications(count: int, *, used: bool) -> Iterator[tuple[float, list[Observation]]]:
-    """For each hold when it began, and what is heard of it."""
+    """Yield the beginning of each hold and its observations."""
     for number in range(count):
         at, seq, client = START + APART * number, 2 * number + 1, f"ws{number % 20}/request-0123456789ab"
         grant, rcs = Grant(TERM, seq), [f"robot/scout{number % 50}", "radio/rf0"]
@@ -43,16 +43,16 @@ def publications(count: int, *, used: bool) -> Iterator[tuple[float, list[Observ
         over = Revocation(name, arc, client, grant, rcs, "completed", "its minimum runtime is over")
         free: dict[str, list[Holder]] = {rc: [] for rc in rcs}
         ends = Grants(TERM, seq + 1, seq, 0.5, free, [over], instances)
-        heard: list[Observation] = [PublicationReceived(at, 0.2, begins), PublicationReceived(at + 30, 0.2, ends)]
-        yield at, heard + ([UseReported([(rc, grant, 27.125) for rc in rcs])] if used else [])
+        seen: list[Observation] = [PublicationReceived(at, 0.2, begins), PublicationReceived(at + 30, 0.2, ends)]
+        yield at, seen + ([UseReported([(rc, grant, 27.125) for rc in rcs])] if used else [])
 
 
 def fill(store: JournalStore, count: int, *, used: bool) -> tuple[list[float], list[float]]:
-    """Seconds to work out what each commit keeps, and to commit it."""
-    follower, heard = Follower(1e9), publications(count, used=used)
+    """Seconds to compute each commit's changes, and to commit them."""
+    follower, observed = Follower(1e9), publications(count, used=used)
     worked, committed = [], []
     for _ in range(count // PER_COMMIT):
-        batch = [next(heard) for _ in range(PER_COMMIT)]
+        batch = [next(observed) for _ in range(PER_COMMIT)]
         began = time.perf_counter()
         changes: list[Change] = [change for _, of in batch for event in of for change in follower.take(event)]
         worked.append(time.perf_counter() - began)
@@ -73,8 +73,8 @@ def answers(store: JournalStore, now: float) -> None:
         ("a pattern of RCs, the latest 100", HistoryAsk(rc="robot/scout1$*", limit=100)),
         ("a user, the latest 100", HistoryAsk(who=["user7"], limit=100)),
         ("an ARC by its id (the oldest)", HistoryAsk(arc=f"{0:012x}")),
-        ("a user that there is not (the whole file)", HistoryAsk(who=["nobody"])),
-        ("a pattern that nothing meets (likewise)", HistoryAsk(rc="video/*")),
+        ("an unknown user (the whole file)", HistoryAsk(who=["nobody"])),
+        ("a pattern without matches (the whole file)", HistoryAsk(rc="video/*")),
         ("a day two months ago", HistoryAsk(since=61 * 86_400.0, until=60 * 86_400.0, limit=MAX_PAGE)),
     ):
         spent = []
@@ -89,7 +89,7 @@ def answers(store: JournalStore, now: float) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--holds", type=int, default=HOLDS)
-    parser.add_argument("--without-use", action="store_true", help="RCs do not tell for how long they were used.")
+    parser.add_argument("--without-use", action="store_true", help="RCs do not report how long they were used.")
     args = parser.parse_args()
     count = args.holds
     with tempfile.TemporaryDirectory(prefix="zscout-bench-") as folder:
@@ -98,7 +98,7 @@ def main() -> None:
         worked, committed = fill(store, count, used=not args.without_use)
         print(f"{count} holds in commits of {PER_COMMIT}, two publications each")
         work, commit = 1e6 * sum(worked) / count, 1e6 * sum(committed) / count
-        print(f"to work one out: {work:.0f} us of a thread; to commit it: {commit:.0f} us")
+        print(f"to compute a hold: {work:.0f} us of a thread; to commit it: {commit:.0f} us")
         quick, slow = statistics.median(committed), sorted(committed)[len(committed) * 99 // 100]
         print(f"a commit: median {1000 * quick:.1f} ms, 99 of 100 within {1000 * slow:.1f} ms")
         print(f"file: {store.size() / 1e6:.1f} MB, {store.size() / count:.0f} bytes a hold")

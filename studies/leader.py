@@ -1,4 +1,4 @@
-"""`python -m studies leader`: the measures of the leader, from its source and from fleets of real nodes."""
+"""`python -m studies leader`: measures of the leader, from its source and from fleets of real nodes."""
 
 from __future__ import annotations
 
@@ -32,19 +32,19 @@ from zscout.types import SECOND
 
 ROOT: Final = Path(__file__).parents[1] / "zscout"
 LEADER: Final = ("rcm/*.py", "services/rcm/*.py", "services/bookings/*.py", "scheduling/calendar.py")
-"""What leads. (The calendar was part of it, and is one of the core now.)"""
+"""The modules of the leader, including the calendar, which now belongs to the core."""
 MOST_PARAMETERS: Final = 8
 MOST_ATTRIBUTES: Final = 20
 SERIES: Final = 49
 """Weekly bookings of one RC: some 420 dates within 60 days."""
 FLOODED: Final = 3.0
-"""Seconds of each flood."""
+"""Seconds of a flood."""
 HEARTBEAT: Final = 0.5
 
 Function = ast.FunctionDef | ast.AsyncFunctionDef
 
 
-# By its source
+# Measures of the source
 
 
 def sources(patterns: tuple[str, ...]) -> Iterator[ast.Module]:
@@ -55,8 +55,8 @@ def sources(patterns: tuple[str, ...]) -> Iterator[ast.Module]:
 def by_source() -> list[Row]:
     lines = sum(path.read_text().count("\n") for pattern in LEADER for path in ROOT.glob(pattern))
     classes = [node for tree in sources(LEADER) for node in ast.walk(tree) if isinstance(node, ast.ClassDef)]
-    wide = [one.name for one in classes if parameters(one) > MOST_PARAMETERS]
-    large = [one.name for one in classes if len(attributes(one)) > MOST_ATTRIBUTES]
+    wide = [node.name for node in classes if parameters(node) > MOST_PARAMETERS]
+    large = [node.name for node in classes if len(attributes(node)) > MOST_ATTRIBUTES]
     assigned = [found for tree in sources(("**/*.py",)) for found in callbacks(tree)]
     return [
         Row("lines of the leader", lines, "", aim=4_200),
@@ -70,20 +70,20 @@ def _named(what: str, found: list[str]) -> str:
     return f"{what}: {', '.join(found)}" if found else what
 
 
-def parameters(one: ast.ClassDef) -> int:
-    """Of its constructor, `self` left out."""
-    made = [node for node in one.body if isinstance(node, Function) and node.name == "__init__"]
+def parameters(of: ast.ClassDef) -> int:
+    """The number of parameters of the class's constructor, without `self`."""
+    made = [node for node in of.body if isinstance(node, Function) and node.name == "__init__"]
     return sum(len(node.args.posonlyargs + node.args.args + node.args.kwonlyargs) - 1 for node in made)
 
 
-def attributes(one: ast.ClassDef) -> set[str]:
-    """What its methods assign to `self`."""
-    assigned = [node for node in ast.walk(one) if isinstance(node, ast.Attribute) and isinstance(node.ctx, ast.Store)]
+def attributes(of: ast.ClassDef) -> set[str]:
+    """The attributes that the class's methods assign to `self`."""
+    assigned = [node for node in ast.walk(of) if isinstance(node, ast.Attribute) and isinstance(node.ctx, ast.Store)]
     return {node.attr for node in assigned if _is_self(node.value)}
 
 
 def callbacks(tree: ast.Module) -> Iterator[str]:
-    """Own methods and lambdas that are assigned to attributes of other objects, and whatever is named `on_` there."""
+    """Yield attributes of other objects to which own methods or lambdas are assigned, or that are named `on_...`."""
     methods = {node.name for node in ast.walk(tree) if isinstance(node, Function) and not node.decorator_list}
     for node in (node for node in ast.walk(tree) if isinstance(node, ast.Assign)):
         value, targets = node.value, [target for target in node.targets if isinstance(target, ast.Attribute)]
@@ -97,11 +97,11 @@ def _is_self(value: ast.expr) -> bool:
     return isinstance(value, ast.Name) and value.id == "self"
 
 
-# By what it does
+# Measures of running fleets
 
 
 async def one_grant(folder: Path) -> list[Row]:
-    """What runs at the leader from the time at which a request leaves its client to the body."""
+    """The calls at the leader from a client's request to the beginning of the body."""
     calls = await trace(folder)
     start = next(at for at, *where in calls["client"] if tuple(where) == ASKING)
     end, leads = calls["client"][-1][0], calls["leader"]
@@ -114,7 +114,7 @@ async def one_grant(folder: Path) -> list[Row]:
 
 
 async def processor_time(folder: Path, rounds: int) -> list[Row]:
-    """Of the node that leads, for a request and its release; what it uses without any is left out."""
+    """The leading node's processor time for a request and its release, without its idle use."""
     async with Lab(folder, candidates=["lead"]) as lab:
         node = psutil.Process(lab.node("lead", extra="load = false").pid)
         lab.node("device", "robot/x", extra="load = false")
@@ -142,7 +142,7 @@ def _spent(process: psutil.Process) -> float:
 
 
 async def takeover(folder: Path, candidates: int) -> list[Row]:
-    """From the death of the leader to a grant, beside dates on one RC that votes."""
+    """Time from the leader's death to a grant, with dates on a voting RC."""
     names = [f"m{number}" for number in range(candidates)]
     async with Lab(folder, candidates=names) as lab:
         for name in names:
@@ -171,25 +171,25 @@ async def takeover(folder: Path, candidates: int) -> list[Row]:
 
 
 async def flooded(folder: Path) -> list[Row]:
-    """How long the leader is not heard beyond a heartbeat, and what an honest client waits, under each flood."""
+    """The leader's silence beyond a heartbeat, and the wait of an honest client, under each flood."""
     rows = []
     async with ClosedLab(folder) as lab:
         lab.node("anvil", "robot/a", "robot/b")
         wall, bob, eve, ada = [await lab.person(name) for name in ("wall", "bob", "eve", "ada")]
         await lab.ready(ada, "robot/a", "robot/b")
         await test_floods.crowd(eve)
-        heard = list[float]()
-        ada.mesh.subscribe(ada.mesh.keys.grants, Grants, lambda *_: heard.append(time.monotonic()))
+        received = list[float]()
+        ada.mesh.subscribe(ada.mesh.keys.grants, Grants, lambda *_: received.append(time.monotonic()))
         for name, asking in test_floods.each(wall, bob, eve).items():
             task = asyncio.create_task(asking)
-            heard[:] = [time.monotonic()]
+            received[:] = [time.monotonic()]
             waits = await _honest(ada)
             task.cancel()
             with suppress(asyncio.CancelledError):
                 await task
-            silent = max(after - before for before, after in itertools.pairwise([*heard, time.monotonic()]))
+            silent = max(after - before for before, after in itertools.pairwise([*received, time.monotonic()]))
             rows += [
-                Row(f"standstill under a flood of {name}", max(0.0, silent - HEARTBEAT), "s", aim=0.1),
+                Row(f"silence under a flood of {name}", max(0.0, silent - HEARTBEAT), "s", aim=0.1),
                 Row("an honest client's grant beside it", waits.median, "s", p99=waits.p99, rounds=len(waits.values)),
             ]
     return rows
@@ -221,7 +221,7 @@ async def live(folder: Path, rounds: int) -> list[Row]:
 def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m studies leader", description=__doc__)
     parser.add_argument("--rounds", type=int, default=500, help="requests (default: 500)")
-    parser.add_argument("--source", action="store_true", help="only what its source says")
+    parser.add_argument("--source", action="store_true", help="only the measures of the source")
     args = parser.parse_args()
     rows = by_source()
     if not args.source:

@@ -1,7 +1,8 @@
-"""`python -m studies metrics`: what figures cost a node. A scrape over a real socket, its client's part included, of
-a small node and of one with 64 RCs that leads the largest fleet whose labels all have values of their own; and what
-counting adds to a grant and its release, after all answers are sent. And the memory of a real node that leads, with and
-without what it tells."""
+"""`python -m studies metrics`: the cost of Prometheus figures for a node.
+
+A scrape over a real socket, including its client's part: of a small node, and of a node with 64 RCs that leads the
+largest fleet with distinct label values. Then the time that counting adds to a grant and its release, after all answers
+are sent; and the memory of a real leading node, with and without `[metrics]` and `[notify]`."""
 
 from __future__ import annotations
 
@@ -30,18 +31,18 @@ from zscout.services.rcm.digest import Began, HoldDigest, HoldListener
 from zscout.types import SECOND, Params, RcName, Term
 
 EVERY = 15.0
-"""Seconds from one scrape to the next."""
+"""Seconds between scrapes."""
 AIM = 0.2
 """Percent of a core."""
 OWN = 64
-"""RCs of one node."""
+"""Most RCs of a node."""
 TABLES = {"neither": "", "[metrics]": "[metrics]", "[notify]": '[notify]\nurls = ["json://127.0.0.1:9/"]'}
-"""What the node file of a node has whose memory is measured."""
+"""Tables in the node file for the measurement of memory, by name."""
 ASK = b"GET /metrics HTTP/1.1\r\nHost: x\r\n\r\n"
 
 
 def figures(rcs: int, waiters: int) -> HoldFigures:
-    """Of a leader whose RCs are all held."""
+    """The figures of a leader with holders of all RCs."""
     found = HoldFigures(AccessPolicy())
     for number in range(max(rcs, waiters)):
         rc = f"robot/scout{number % rcs}"
@@ -51,7 +52,7 @@ def figures(rcs: int, waiters: int) -> HoldFigures:
 
 
 async def scrapes(rcs: int, waiters: int, rounds: int) -> tuple[Samples, Samples, int]:
-    """Seconds of this process's processor for each, seconds for which the event loop stood still, and bytes."""
+    """Processor seconds of a scrape in this process, seconds for which it blocked the event loop, and its bytes."""
     holds, spent, stood = figures(rcs, waiters), Samples(), Samples()
     commands: dict[tuple[str, ...], Value] = {(f"robot/scout{number}",): 5.0 for number in range(min(rcs, OWN))}
     refused: dict[tuple[str, ...], Value] = {(*rc, f"code_{code}"): 1.0 for rc in commands for code in range(4)}
@@ -78,7 +79,7 @@ async def scrapes(rcs: int, waiters: int, rounds: int) -> tuple[Samples, Samples
 
 
 def instants(listeners: Sequence[HoldListener], rounds: int) -> Samples:
-    """Seconds for an ARC of five RCs that is asked for, granted and released."""
+    """Seconds for the request, grant and release of an ARC with five RCs."""
     core, samples = Core(), Samples()
     digest = HoldDigest(core, listeners) if listeners else None
     needs: dict[RcName, Params] = {f"robot/r{number}": {} for number in range(5)}
@@ -102,11 +103,11 @@ async def memory() -> AsyncIterator[Row]:
                 await lab.ready(await lab.client(), "robot/a")
                 await asyncio.sleep(SETTLED)
                 size = psutil.Process(lab.nodes["anvil"].pid).memory_info().rss
-        yield Row(f"RSS, node that leads, {name}", size / MEGA, "MB")
+        yield Row(f"RSS, leading node, {name}", size / MEGA, "MB")
 
 
 async def measure() -> list[Row]:
-    server_module.FRESH = -1.0  # type: ignore[misc]  # each is made anew
+    server_module.FRESH = -1.0  # type: ignore[misc]  # build new figures for each
     rows = []
     for name, rcs, waiters, rounds in (("6 RCs", 6, 3, 300), (f"{MAX_RCS:,} RCs", MAX_RCS, MAX_WAITERS, 30)):
         spent, stood, size = await scrapes(rcs, waiters, rounds)

@@ -1,4 +1,4 @@
-"""Options that several studies share, their checks, and the output of a report."""
+"""Options of several studies, their checks, and the output of a report."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from zscout.config.strict import BadInput, quoted
 
 MAX_SEED: Final = 1_000_000
 MAX_SEEDS: Final = 1_000
-"""Seeds of one run at most: more take hours."""
+"""Most seeds of a run: more take hours."""
 MAX_PROCESSES: Final = 256
 MAX_LISTED: Final = 64
 
@@ -23,7 +23,7 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 
 def seed_option(default: str, help: str, most: int | None = None) -> Callable[[F], F]:  # noqa: A002
-    """`--seed A|A-B`: one, or those from A to B."""
+    """`--seed A|A-B`: a seed, or a range of seeds."""
     seeds = Parsed("text", lambda text, _option: parse_seeds(text if "-" in text else f"{text}-{text}", most, "--seed"))
     return click.option("--seed", "seeds", metavar="A|A-B", type=seeds, default=default, help=help)
 
@@ -54,7 +54,7 @@ def parse_seeds(text: str, most: int | None = None, option: str = "--seeds") -> 
     """`20` is 0 to 19, `5-9` is 5 to 9; no more than `most`. Raises BadInput."""
     found = re.fullmatch(r"(?:(\d{1,7})-)?(\d{1,7})", text)
     if found is None:
-        raise BadInput(f"{option} {quoted(text)}: write how many, as in 20, or from which to which, as in 5-9")
+        raise BadInput(f"{option} {quoted(text)}: write a number, as in 20, or a range, as in 5-9")
     first, last = int(found[1] or 0), int(found[2])
     seeds = range(first, last + 1) if found[1] else range(last)
     if not seeds:

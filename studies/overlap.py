@@ -1,12 +1,12 @@
-"""Does `exclusive` mean exclusive? One `zscout request` after the other runs a program that ignores SIGTERM, holds a
-lock file and leaves a child in a session of its own that holds it too: whether the next one ever runs beside it, and
-how long it waits for that.
+"""Does `exclusive` mean exclusive? Successive `zscout request` commands run a program that ignores SIGTERM, holds a
+lock file and leaves a child with the same lock in a session of its own. Does the next program ever run beside it, and
+how long does it wait?
 
     python -m studies overlap --times 20 --cut 5 --kill 5        (needs root, network namespaces, iproute2)
 
-Of so many ends of a hold some come by cutting the program's host off, some by `kill -9` of its `zscout request`, some
-by freezing that; the others are preemptions. Exit code 0: none ran beside another, and none waited for longer than the
-rule allows; 1: else; 2: it can't run here."""
+Some holds end because the program's host is cut off, some by `kill -9` of their `zscout request`, some by freezing it;
+the others by preemption. Exit code 0: no program ran beside another, or waited for longer than the rule allows; 1: one
+did; 2: it can't run here."""
 
 from __future__ import annotations
 
@@ -41,11 +41,11 @@ RC: Final = "robot/x"
 LEADER, DEVICE, LEFT, RIGHT = "lead", "device", "left", "right"
 LOOK: Final = 0.02
 WITHIN: Final = 600.0
-"""Seconds after which what is waited for counts as what never comes."""
+"""Longest wait for any condition, in seconds."""
 FOREVER: Final = "1h"
 SLACK: Final = 2.0
-"""Seconds beside the rule: from a client's question whether it has settled to its program's first line, on a machine
-that does more than this."""
+"""Seconds in addition to the rule: from a client's query whether its RC has settled to its program's first line, on a
+busy machine."""
 
 PROGRAM: Final = """
 import fcntl, os, signal, sys, time
@@ -65,22 +65,22 @@ if os.fork() == 0:
         os._exit(0)
 time.sleep(3600)
 """
-"""Of `python -S -c`. Its lock is that of both its processes: it is free when the last of them is gone."""
+"""For `python -S -c`. Both its processes share its lock, which is free when the last of them is gone."""
 
 
 class NeverCame(Exception):
-    """What was waited for."""
+    """A condition was not met in time."""
 
 
 class Begun(NamedTuple):
-    """A program that runs: whether alone, and since when."""
+    """The start of a program: `alone` if no other program ran, and when."""
 
     alone: bool
     at: Ns
 
 
 class Programs:
-    """What the programs have told in a folder."""
+    """The starts that programs have recorded in a folder."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -96,11 +96,11 @@ class Programs:
 
 
 class Taken(NamedTuple):
-    """How one program followed another. Times in ns of this host's clock."""
+    """A program that followed another. Times in ns of this host's clock."""
 
     how: How
     ended: Ns
-    """When the end of the former hold was brought about: by a fault, or else by the grant."""
+    """When the former hold was ended: by a fault, or by the grant."""
     begun: Begun
 
     @property
@@ -109,21 +109,21 @@ class Taken(NamedTuple):
 
     @property
     def allowed(self) -> float:
-        """Seconds, by rule 2: `settle` from the client's `leaving` on, or else from a hold lease after the RC last
-        confirmed it."""
+        """Seconds by rule 2: `settle` from the client's `leaving`, or a hold lease and `settle` from the RC's last
+        confirmation."""
         lease = 0 if self.how == "preempted" else default_fleet().timing.hold_lease
         return (lease + DEFAULT_SETTLE) / SECOND
 
 
 class Request:
-    """A `zscout request` on one host, and when it said what."""
+    """A `zscout request` on a host, and the times of its events."""
 
     def __init__(self, host: str, command: list[str], env: dict[str, str], log: Path) -> None:
         self.host, self._log = host, log
         self.process = subprocess.Popen(
             command, env=env, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
         )
-        self.said: dict[str, Ns] = {}
+        self.events: dict[str, Ns] = {}
         threading.Thread(target=self._listen, daemon=True).start()
 
     def _listen(self) -> None:
@@ -132,11 +132,11 @@ class Request:
             for line in self.process.stderr:
                 log.write(line)
                 with suppress(ValueError):
-                    self.said.setdefault(json.loads(line)["event"], clock.now())
+                    self.events.setdefault(json.loads(line)["event"], clock.now())
 
 
 class Rounds:
-    """A fleet in namespaces of its own: a leader, a device, and two hosts whose programs follow each other."""
+    """A fleet in its own namespaces: a leader, a device, and two hosts whose programs follow each other."""
 
     def __init__(self, folder: Path) -> None:
         self.net = Net((LEADER, DEVICE, LEFT, RIGHT))
@@ -189,7 +189,7 @@ class Rounds:
         self._requests.append(Request(host, command, env, self.folder / f"{host}.log"))
         return self._requests[-1]
 
-    def run(self, hows: list[How], tell: Callable[[Taken], None]) -> list[Taken]:
+    def run(self, hows: list[How], report: Callable[[Taken], None]) -> list[Taken]:
         """Raises NeverCame."""
         priority = 0
         former = self._first()
@@ -198,13 +198,13 @@ class Rounds:
             priority += how == "preempted"
             following = self.request(number, priority)
             taken.append(self._follow(how, former, following, number))
-            tell(taken[-1])
-            self._mend(former)
+            report(taken[-1])
+            self._restore(former)
             former = following
         return taken
 
     def _first(self) -> Request:
-        """Once there is a leader that sees the device."""
+        """The first request, as soon as a leader sees the device."""
         first = self.request(0, 0)
 
         def runs() -> bool:
@@ -218,10 +218,10 @@ class Rounds:
 
     def _follow(self, how: How, former: Request, following: Request, number: int) -> Taken:
         if how == "preempted":
-            self._until("it preempts", lambda: following.said.keys() & {"settling", "granted"}, following)
-            ended = min(at for event, at in following.said.items() if event in ("settling", "granted"))
+            self._until("it preempts", lambda: following.events.keys() & {"settling", "granted"}, following)
+            ended = min(at for event, at in following.events.items() if event in ("settling", "granted"))
         else:
-            self._until("it waits", lambda: "waits" in following.said, following)
+            self._until("it waits", lambda: "waits" in following.events, following)
             ended = clock.now()
             self._strike(how, former)
         self._until("the next program runs", lambda: number in self.programs.begun(), following)
@@ -234,15 +234,15 @@ class Rounds:
         else:
             request.process.send_signal(signal.SIGKILL if how == "killed" else signal.SIGSTOP)
 
-    def _mend(self, request: Request) -> None:
-        """The former one's host is back, and its client has ended."""
+    def _restore(self, request: Request) -> None:
+        """Restore the host of the former request, and wait until its client has ended."""
         self.net.cut(())
         request.process.send_signal(signal.SIGCONT)
         request.process.terminate()
         self._until("the former request has ended", lambda: request.process.poll() is not None)
 
     def _until(self, what: str, done: Callable[[], object], of: Request | None = None) -> None:
-        """Raises NeverCame: not in time, or the request `of` which that is awaited has ended."""
+        """Wait until `done`. Raises NeverCame if it takes too long, or if the request `of` has ended."""
         deadline = time.monotonic() + WITHIN
         while not done():
             ended = of is not None and of.process.poll() is not None
@@ -254,12 +254,12 @@ class Rounds:
 
 def main() -> int:
     options = argparse.ArgumentParser(prog="python -m studies overlap", description=__doc__.partition("\n\n")[0])
-    options.add_argument("--times", type=int, default=20, help="so many ends of a hold (20)")
-    options.add_argument("--cut", type=int, default=5, help="of them by cutting the program's host off (5)")
-    options.add_argument("--kill", type=int, default=5, help="of them by kill -9 of its zscout request (5)")
-    options.add_argument("--freeze", type=int, default=0, help="of them by SIGSTOP of its zscout request (0)")
-    options.add_argument("--seed", type=int, default=1, help="their order (1)")
-    options.add_argument("--slack", type=float, default=SLACK, help=f"seconds beside the rule ({SLACK:g})")
+    options.add_argument("--times", type=int, default=20, help="number of ended holds (20)")
+    options.add_argument("--cut", type=int, default=5, help="of these, by cutting the program's host off (5)")
+    options.add_argument("--kill", type=int, default=5, help="of these, by kill -9 of its zscout request (5)")
+    options.add_argument("--freeze", type=int, default=0, help="of these, by SIGSTOP of its zscout request (0)")
+    options.add_argument("--seed", type=int, default=1, help="seed of their order (1)")
+    options.add_argument("--slack", type=float, default=SLACK, help=f"seconds in addition to the rule ({SLACK:g})")
     asked = options.parse_args()
     faults: dict[How, int] = {"cut off": asked.cut, "killed": asked.kill, "frozen": asked.freeze}
     faults["preempted"] = asked.times - sum(faults.values())
@@ -274,22 +274,22 @@ def main() -> int:
     folder = Path(tempfile.mkdtemp(prefix="zscout-overlap-"))
     numbers = itertools.count(1)
 
-    def tell(one: Taken) -> None:
-        beside = "" if one.begun.alone else "  RAN BESIDE THE FORMER ONE"
-        wait = f"the next program ran {one.waited:5.2f} s later, {one.allowed:g} allowed"
-        print(f"{next(numbers):3}  {one.how:9}  {wait}{beside}", flush=True)
+    def report(follow: Taken) -> None:
+        beside = "" if follow.begun.alone else "  RAN BESIDE THE FORMER PROGRAM"
+        wait = f"the next program ran {follow.waited:5.2f} s later, {follow.allowed:g} allowed"
+        print(f"{next(numbers):3}  {follow.how:9}  {wait}{beside}", flush=True)
 
     try:
         with Rounds(folder) as rounds:
-            taken = rounds.run(hows, tell)
+            taken = rounds.run(hows, report)
     except NeverCame as error:
         print(f"overlap: {error}", file=sys.stderr)
         return 1
-    beside = sum(not one.begun.alone for one in taken)
-    late = [one for one in taken if one.waited > one.allowed + asked.slack]
-    print(f"{len(taken)} ends of a hold, {beside} programs ran beside the former one, {len(late)} waited too long")
+    beside = sum(not follow.begun.alone for follow in taken)
+    late = [follow for follow in taken if follow.waited > follow.allowed + asked.slack]
+    print(f"{len(taken)} ends of a hold, {beside} programs ran beside the former program, {len(late)} waited too long")
     for how in dict.fromkeys(hows):
-        waits = [one.waited for one in taken if one.how == how]
+        waits = [follow.waited for follow in taken if follow.how == how]
         print(f"{how:9}  {len(waits)} times: median {median(waits):.2f} s, at most {max(waits):.2f} s")
     if beside or late:
         print(f"logs are in {folder}", file=sys.stderr)

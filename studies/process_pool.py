@@ -1,9 +1,8 @@
-"""Work spread over processes that end with whoever started them.
+"""Work distributed over processes that end with their parent.
 
-Each process has a pipe of its own, whose other end it alone holds: a process that is killed, even in the
-middle of an answer, is the end of its pipe. The processes of `concurrent.futures.ProcessPoolExecutor` share
-one pipe, whose writing end their parent holds as well: when one of them was killed in the middle of an
-answer, the parent waited for the rest of it for ever.
+Each process has its own pipe, and only it holds the other end. So the pipe ends when the process is killed, even in the
+middle of an answer. The processes of `concurrent.futures.ProcessPoolExecutor` share one pipe, and their parent also
+holds its writing end: when a process was killed in the middle of an answer, the parent waited forever for the rest.
 """
 
 from __future__ import annotations
@@ -34,8 +33,8 @@ A = TypeVar("A")
 async def run_trials(
     work: Callable[[J], A], jobs: Sequence[J], processes: int | None, take: Callable[[A], None]
 ) -> None:
-    """Hands the answers of `work` to `take`, in the order of the jobs, with a bar at a terminal; on all
-    processors unless `processes` says on how many. Raises what `answers` raises."""
+    """Pass the answers of `work` to `take`, in the order of the jobs, with a progress bar at a terminal. By default
+    there are as many `processes` as processors. Raises the exceptions of `answers`."""
     processes = processes or min(MAX_PROCESSES, len(os.sched_getaffinity(0)))
     with terminal.progress(len(jobs)) as advance:
         async with aclosing(answers(work, jobs, processes)) as found:
@@ -45,11 +44,11 @@ async def run_trials(
 
 
 async def answers(work: Callable[[J], A], jobs: Sequence[J], processes: int) -> AsyncGenerator[A, None]:
-    """Runs `work`, a function of a module, on each job; yields the answers in the order of the jobs. However
-    it ends, no process is left. Raises Failed if a process dies or can't start, BadInput that `work`
-    raised, and RuntimeError where it raised something else.
+    """Run `work`, a module-level function, on each job, and yield the answers in the order of the jobs. At its end no
+    process is left. Raises Failed if a process dies or can't start, BadInput if `work` raised it, and RuntimeError for
+    other exceptions of `work`.
 
-    Close the iterator (`contextlib.aclosing`) if it is not read to its end."""
+    Close the iterator (`contextlib.aclosing`) if you do not read it to its end."""
     answered: asyncio.Queue[tuple[_Worker[J, A], A | Exception]] = asyncio.Queue()
     loop = asyncio.get_running_loop()
     workers: list[_Worker[J, A]] = []
@@ -68,7 +67,7 @@ async def answers(work: Callable[[J], A], jobs: Sequence[J], processes: int) -> 
                 done[worker.number] = answer
                 if (job := next(rest, None)) is not None:
                     worker.send(*job)
-                # So that a signal ends this between two answers, however fast they come.
+                # A signal can end this between two answers, however fast they come.
                 await asyncio.sleep(0)
             yield done.pop(number)
     finally:
@@ -82,21 +81,21 @@ def _receive(worker: _Worker[J, A], answered: asyncio.Queue[tuple[_Worker[J, A],
 
 
 class _Worker(Generic[J, A]):
-    """A process that runs one job at a time, and this end of its pipe. Raises Failed if it can't start."""
+    """A process that runs a job at a time, and the parent's end of its pipe. Raises Failed if it can't start."""
 
     def __init__(self, work: Callable[[J], A]) -> None:
-        # Spawned, not forked: this process has threads by now (the progress bar's).
+        # Spawned, not forked, because this process has threads (of the progress bar).
         context = multiprocessing.get_context("spawn")
         self.number = -1
-        """Of the job that it runs."""
-        # Started together with a process, multiprocessing's tracker would let the signals through again.
+        """Number of its job."""
+        # If it were started together with a process, multiprocessing's tracker would unblock the signals.
         resource_tracker.ensure_running()
-        # The process inherits the mask: it is this one that ends it.
+        # The process inherits the mask, because its parent ends it.
         before = signal.pthread_sigmask(signal.SIG_BLOCK, ENDING)
         try:
             self.pipe, theirs = context.Pipe()
             self._process = context.Process(target=_serve, args=(work, theirs), daemon=True)
-            # Closed here, so that only the process holds it: its death is the pipe's end.
+            # Closed here, so that only the process holds it, and the pipe ends with the process.
             with theirs:
                 self._process.start()
         except OSError as error:
@@ -106,16 +105,16 @@ class _Worker(Generic[J, A]):
 
     def send(self, number: int, job: J) -> None:
         self.number = number
-        # `receive` reports a process that is gone.
+        # `receive` reports dead processes.
         with suppress(OSError):
             self.pipe.send(job)
 
     def receive(self) -> A | Exception:
-        """The answer to the job, or what to raise instead."""
+        """Return the answer to the job, or an exception to raise."""
         try:
             answer: A | Exception = self.pipe.recv()
         except (EOFError, OSError):
-            return Failed("a process of the study died, perhaps for want of memory; use fewer with --jobs 1")
+            return Failed("a process of the study died, perhaps because memory ran out; use fewer with --jobs 1")
         return answer
 
     def kill(self) -> None:
@@ -141,12 +140,12 @@ def _answer(work: Callable[[J], A], job: J) -> A | Exception:
         return work(job)
     except BadInput as bad:
         return bad
-    except Exception:  # noqa: BLE001 - whatever it is, the parent shows it
+    except Exception:  # noqa: BLE001 - the parent shows it
         return RuntimeError(f"{job} failed:\n{traceback.format_exc()}")
 
 
 def _end_with_parent() -> None:
-    """A parent that is killed can't end its children: they see to it themselves."""
+    """End this process when its parent dies: a killed parent can't end its children."""
     parent = multiprocessing.parent_process()
     if parent is not None:
         wait([parent.sentinel])

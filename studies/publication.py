@@ -1,9 +1,9 @@
-"""`python -m studies publication`: what a publication on `rcm/grants` costs its leader, by sessions that hear it.
+"""`python -m studies publication`: the cost of a publication on `rcm/grants` for its leader, by receiving sessions.
 
-The listeners do with it what a client does, which is to keep the latest without being woken. They are children, ten
-sessions each: `python -m studies.publication listen FLEET_FILE SESSIONS`. Publications are of a grant of five RCs,
-at an even pace; their cost is the call itself, and all processor time of the publishing process, Zenoh's threads
-included, less what it uses while it publishes nothing."""
+The listeners process it like clients: they keep the latest publication, without waking up. They are child processes
+with ten sessions each: `python -m studies.publication listen FLEET_FILE SESSIONS`. Each publication contains a grant of
+five RCs, at an even pace. Its cost is the call itself, and the processor time of the publishing process, with Zenoh's
+threads, minus its idle use."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ from zscout.types import Grant, Place, Term
 
 SESSIONS = (2, 20, 100)
 EACH = 10
-"""Sessions of one child."""
+"""Sessions of a child process."""
 PACE = 0.005
-"""Seconds from one publication to the next."""
+"""Seconds between publications."""
 SETTLED = 3.0
 TERM = Term(1, "0123456789ab")
 RCS = [f"robot/r{number}" for number in range(5)]
@@ -55,7 +55,7 @@ def granted(number: int) -> Grants:
 
 
 async def measure(sessions: int, count: int) -> tuple[float, float]:
-    """Seconds of the call, and of the processor, for one publication."""
+    """Seconds of the call, and of processor time, for a publication."""
     with tempfile.TemporaryDirectory(prefix="zscout-bench-") as name, ExitStack() as stack:
         lab = Lab(Path(name))
         while sessions:

@@ -1,6 +1,6 @@
-"""What the recordings of all studies share: the file, its page of tabs beside a summary, and curves.
+"""The common parts of the studies' recordings: the file, its page of tabs beside a summary, and curves.
 
-Rerun is large and is loaded by these functions alone.
+Only these functions import Rerun, which is large.
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ VIRTUAL_TIME: Final = "virtual_time"
 COLOURS: Final = (0x56C1FFFF, 0xFFB454FF, 0xB5E07BFF, 0xD6A6FFFF)
 """RGBA."""
 MARGIN: Final = 0.03
-"""Part of the whole that is left free at the sides of a plot."""
+"""Free part of the width at the sides of a plot."""
 WRITE_SECONDS: Final = 10.0
 
 
 @contextmanager
 def recording(path: Path, application: str, blueprint: rrb.Blueprint, summary: str) -> Iterator[rr.RecordingStream]:
-    """A recording that replaces what was there; `summary`, in Markdown, is shown beside its tabs.
+    """A recording that replaces an existing file; `summary`, in Markdown, is shown beside its tabs.
 
-    Raises BadInput where the file can't be written."""
+    Raises BadInput if the file can't be written."""
     import rerun as rr
 
     stream = rr.RecordingStream(application)
@@ -53,15 +53,15 @@ def tabs_and_summary(tabs: Sequence[rrb.Container], time: str, shares: tuple[int
 
     root = rrb.Horizontal(
         rrb.Tabs(*tabs, active_tab=0),
-        rrb.TextDocumentView(origin="/summary", name="What was found"),
+        rrb.TextDocumentView(origin="/summary", name="Results"),
         column_shares=list(shares),
     )
-    # Else it plays, and the cursor runs over plots that show everything anyway.
+    # Otherwise it plays, and the cursor moves over plots that show everything anyway.
     return page(root, timeline=time, play_state="following")
 
 
 def whole_time(end: Ns) -> rrb.archetypes.TimeAxis:
-    """An axis from 0 to `end`: without it a plot shows what the viewer's cursor is near."""
+    """An axis from 0 to `end`: without it, a plot shows only times near the viewer's cursor."""
     import rerun as rr
     import rerun.blueprint as rrb
 

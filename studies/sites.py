@@ -1,10 +1,10 @@
-"""A fleet over two sites, whose hosts reach each other by a relay alone: what that costs, and whether a hold inside a
-site feels that the relay dies and comes back.
+"""A fleet over two sites whose hosts reach each other only through a relay: its cost, and whether the relay's failure
+and return disturb a hold inside a site.
 
     python -m studies sites --merges 20 --frozen 5 --cut 5      (needs root, network namespaces, iproute2)
 
-Two programs that hold and command devices of their own sites run through all merges. Exit code 0: none of them was
-disturbed; 1: else; 2: it can't run here."""
+Two programs hold and command devices of their own sites during all merges. Exit code 0: neither was disturbed; 1: one
+was; 2: it can't run here."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ SITES: Final = ("a", "b")
 GATE: Final = "gate"
 """The relay."""
 SPARE: Final = "spare"
-"""A second one, where there are two."""
+"""The second relay, if there are two."""
 GATES: Final = (GATE, SPARE)
 NODES: Final = {
     "a1": ("robot/a1",),
@@ -45,10 +45,10 @@ NODES: Final = {
     "b1": ("robot/b1",),
     "b2": ("robot/b2", "robot/b3"),
 }
-"""The hosts of both sites, with their RCs. The first of each may lead."""
+"""The hosts of both sites, with their RCs. The first host of each site may lead."""
 ALL: Final = frozenset(rc for rcs in NODES.values() for rc in rcs)
 Fault: TypeAlias = Literal["killed", "frozen", "cut"]
-"""What happens to the relay; the last: site b's line to it."""
+"""A fault of the relay. `cut`: of its line to site b."""
 INSIDE, ACROSS = "inside", "across"
 WARM_UP: Final = 20
 ROLES: Final = """
@@ -67,7 +67,7 @@ b2 = ["robot/b2", "robot/b3"]
 
 
 class SitesNet:
-    """A network for each site, bridge and all, and a host that has a foot in both and forwards nothing."""
+    """A network with a bridge for each site, and relay hosts that are in both networks and forward no packets."""
 
     def __init__(self) -> None:
         self.hosts = {site: [host for host in (*NODES, f"{site}desk") if host[0] == site] for site in SITES}
@@ -86,7 +86,7 @@ class SitesNet:
             net.ip("netns", "add", self.space(host))
             net.ip("-n", self.space(host), "link", "set", "lo", "up")
         for number, site in enumerate(SITES):
-            # The bridge in a namespace of its own: it goes with that.
+            # The bridge has its own namespace, and is removed with it.
             lan = self.space(f"lan{site}")
             net.ip("netns", "add", lan)
             net.ip("-n", lan, "link", "add", "lan", "type", "bridge", "mcast_snooping", "0")
@@ -100,7 +100,7 @@ class SitesNet:
                 net.ip("-n", space, "route", "append", "224.0.0.0/4", "dev", card)
 
     def plug(self, site: str, state: Literal["up", "down"]) -> None:
-        """The relay's cable to a site."""
+        """Set the relay's cable to a site up or down."""
         net.ip("-n", self.space(f"lan{site}"), "link", "set", GATE, state)
 
     def close(self) -> None:
@@ -108,16 +108,16 @@ class SitesNet:
 
 
 class Program(HolderProcess):
-    """`tests/live/holder.py` at a desk of one site."""
+    """`tests/live/holder.py` at the desk of a site."""
 
     site: str
     grant: Grant
-    """Its last."""
+    """Its last grant."""
     beats: int
-    """How often its RCs had obeyed, from one `trouble` to the next."""
+    """Number of obeyed commands between the last two calls of `trouble`."""
 
     async def trouble(self) -> list[dict[str, Any]]:
-        """What it has said, since it was asked last, that it would not say if it had been left alone."""
+        """The events of a disturbance since the last call."""
         await self.order("beats")
         assert self.process.stdout is not None
         found, self.disturbed = self.disturbed, []
@@ -129,10 +129,10 @@ class Program(HolderProcess):
                     return found
                 if event["event"] != "running" or msgspec.convert(event["grant"], Grant) != self.grant:
                     found.append(event)
-        raise AssertionError(f"{self.name} ended; it said {found}")
+        raise AssertionError(f"{self.name} ended; its events: {found}")
 
     async def works_on(self) -> list[dict[str, Any]]:
-        """Waits until its RCs have obeyed once more. Returns the trouble that it had until then."""
+        """Wait until its RCs have obeyed once more. Return its trouble until then."""
         found = await self.trouble()
         self.beats = 0
         while not (found or self.beats):
@@ -147,14 +147,14 @@ class Program(HolderProcess):
         await self.order("ask", arc=arc, needs={rc: {} for rc in rcs}, min_runtime=600)
 
     async def enters(self) -> Ns:
-        """Returns when it did."""
+        """Wait until it enters its hold. Return when it did."""
         entered = await self.event("entered")
         self.grant = msgspec.convert(entered["grant"], Grant)
         at: Ns = entered["at"]
         return at
 
     async def works(self, arc: str, *rcs: str) -> None:
-        """Asks, enters, and commands these RCs from now on."""
+        """Request and enter a hold, and command these RCs from now on."""
         await self.asks(arc, *rcs)
         await self.enters()
         self.disturbed = []
@@ -166,7 +166,7 @@ class Program(HolderProcess):
 
 
 class Sites:
-    """The fleet: in each site two nodes and a desk for programs. Use as an async context manager."""
+    """The fleet: two nodes and a desk for programs in each site. Use as an async context manager."""
 
     def __init__(self, folder: Path, *, secured: bool = False, lease: float = 1.0, relays: int = 1) -> None:
         self.folder, self.net, self.secured = folder, SitesNet(), secured
@@ -225,12 +225,12 @@ class Sites:
         self.net.close()
 
     def env(self, site: str) -> dict[str, str]:
-        """For programs of a site."""
+        """The environment for programs of a site."""
         env = {name: value for name, value in os.environ.items() if not name.startswith("ZSCOUT_")}
         return env | {"ZSCOUT_FLEET": str(self.folder / f"{site}.fleet.toml")}
 
     async def program(self, site: str, name: str) -> Program:
-        """Starts a program at the desk of a site, and waits until it is on the mesh."""
+        """Start a program at the desk of a site, and wait until it is on the mesh."""
         with (self.folder / f"{name}.log").open("ab") as log:
             process = await asyncio.create_subprocess_exec(
                 *("ip", "netns", "exec", self.net.space(f"{site}desk"), sys.executable, "-m", "tests.live.holder"),
@@ -265,7 +265,7 @@ class Sites:
                 self.net.plug("b", "up")
 
     async def sees(self, program: Program, until: Callable[[RcmState], bool]) -> RcmState:
-        """The RCM's state, as this program is told it, as soon as `until` holds of it."""
+        """Wait until the RCM's state, as seen by this program, fulfils `until`, and return it."""
 
         def logs() -> str:
             return "\n".join(f"--- {host}\n{(self.folder / f'{host}.log').read_text()}" for host in (GATE, *NODES))
@@ -275,14 +275,14 @@ class Sites:
         return seen
 
     async def whole(self, *programs: Program) -> RcmState:
-        """Waits until one RCM has the devices of both sites, for all of these programs."""
-        states = [await self.sees(one, lambda state: present(state) == ALL) for one in programs]
+        """Wait until all these programs see the same RCM with the devices of both sites."""
+        states = [await self.sees(program, lambda state: present(state) == ALL) for program in programs]
         while len({state.term for state in states}) > 1:
-            states = [await self.sees(one, lambda state: present(state) == ALL) for one in programs]
+            states = [await self.sees(program, lambda state: present(state) == ALL) for program in programs]
         return states[0]
 
     async def apart(self, program: Program) -> RcmState:
-        """Waits until a program's site leads itself."""
+        """Wait until the program's site has its own leader."""
         own = {rc for rc in ALL if rc.startswith(f"robot/{program.site}")}
         return await self.sees(program, lambda state: state.host[0] == program.site and present(state) == own)
 
@@ -292,8 +292,8 @@ def present(state: RcmState) -> set[str]:
 
 
 async def times(sites: Sites, rounds: int) -> dict[str, list[Ns]]:
-    """From a request to the confirmed grant, one after the other: by a program in the site of leader and RC, and by one
-    in the other site."""
+    """Times from a request to the confirmed grant, alternately of a program in the site of leader and RC, and of a
+    program in the other site."""
     programs = {site: await sites.program(site, f"timer-{site}") for site in SITES}
     leads = (await sites.whole(*programs.values())).host[0]
     found: dict[str, list[Ns]] = {INSIDE: [], ACROSS: []}
@@ -309,10 +309,10 @@ async def times(sites: Sites, rounds: int) -> dict[str, list[Ns]]:
 
 
 async def successions(sites: Sites, rounds: int) -> list[Ns]:
-    """From `kill -9` of a holder in one site until the next one, in the other, has entered its body.
+    """Times from `kill -9` of a holder in one site until the next holder, in the other site, has entered its body.
 
     Another program stays at each desk: a leader that loses the last programs of two hosts within a quarter of a lease
-    takes itself for cut off, and the next client that goes for unseen, for a lease."""
+    assumes that it is cut off itself, and does not release the next lost client for a lease."""
     found = []
     stay = [await sites.program(site, f"stays-{site}") for site in SITES]
     await sites.whole(*stay)
@@ -336,12 +336,12 @@ async def successions(sites: Sites, rounds: int) -> list[Ns]:
 class Merge(NamedTuple):
     fault: Fault
     took: float
-    """Seconds from the relay's return until one RCM had all devices, for programs of both sites."""
+    """Seconds from the relay's return until programs of both sites saw one RCM with all devices."""
     trouble: list[dict[str, Any]]
 
 
-async def merges(sites: Sites, faults: Sequence[Fault], down: float, tell: Callable[[Merge], None]) -> list[Merge]:
-    """`down`: for how many seconds the sites are apart."""
+async def merges(sites: Sites, faults: Sequence[Fault], down: float, report: Callable[[Merge], None]) -> list[Merge]:
+    """`down`: seconds for which the sites are apart."""
     found: list[Merge] = []
     programs: list[Program] = []
     for number, fault in enumerate(faults):
@@ -361,7 +361,7 @@ async def merges(sites: Sites, faults: Sequence[Fault], down: float, tell: Calla
         took = time.monotonic() - back
         trouble = [event for program in programs for event in await program.works_on()]
         found.append(Merge(fault, took, trouble))
-        tell(found[-1])
+        report(found[-1])
         if trouble:
             for program in programs:
                 program.kill()
@@ -370,39 +370,42 @@ async def merges(sites: Sites, faults: Sequence[Fault], down: float, tell: Calla
 
 
 async def measure(asked: argparse.Namespace, folder: Path) -> bool:
-    """Prints what it finds. Returns whether nobody was disturbed."""
+    """Print the results. Return True if no program was disturbed."""
     numbers = itertools.count(1)
 
-    def tell(one: Merge) -> None:
-        what = f"DISTURBED: {one.trouble}" if one.trouble else "nobody disturbed"
-        print(f"{next(numbers):3}  relay {one.fault}  one fleet {one.took:5.2f} s after its return, {what}", flush=True)
+    def report(merge: Merge) -> None:
+        what = f"DISTURBED: {merge.trouble}" if merge.trouble else "not disturbed"
+        print(
+            f"{next(numbers):3}  relay {merge.fault}  one fleet {merge.took:5.2f} s after its return, {what}",
+            flush=True,
+        )
 
     async with Sites(folder, secured=asked.secured) as sites:
         if asked.grants:
             took = await times(sites, asked.grants)
-            inside, across = (median(took[one]) / 1e6 for one in (INSIDE, ACROSS))
+            inside, across = (median(took[way]) / 1e6 for way in (INSIDE, ACROSS))
             print(f"grant inside {inside:.2f} ms, across {across:.2f} ms: {across / inside:.2f} times ({asked.grants})")
         if asked.kills:
-            gaps = [one / 1e6 for one in await successions(sites, asked.kills)]
+            gaps = [gap / 1e6 for gap in await successions(sites, asked.kills)]
             print(f"kill -9, next across: median {median(gaps):.0f} ms, at most {max(gaps):.0f} ms ({len(gaps)})")
         faults: list[Fault] = [*["frozen"] * asked.frozen, *["cut"] * asked.cut]  # type: ignore[list-item]
         faults += ["killed"] * (asked.merges - len(faults))
         random.Random(asked.seed).shuffle(faults)  # noqa: S311
-        found = await merges(sites, faults, asked.down, tell)
+        found = await merges(sites, faults, asked.down, report)
         if found:
-            well, waits = sum(not one.trouble for one in found), [one.took for one in found]
+            well, waits = sum(not merge.trouble for merge in found), [merge.took for merge in found]
             print(
-                f"{well} of {len(found)} merges disturbed nobody; one fleet after {median(waits):.2f} s, at most "
+                f"{well} of {len(found)} merges disturbed no program; one fleet after {median(waits):.2f} s, at most "
                 f"{max(waits):.2f} s"
             )
-    return not any(one.trouble for one in found)
+    return not any(merge.trouble for merge in found)
 
 
 def main() -> int:
     options = argparse.ArgumentParser(prog="python -m studies sites", description=__doc__.partition("\n\n")[0])
-    options.add_argument("--merges", type=int, default=20, help="so often the relay goes and comes back (20)")
-    options.add_argument("--frozen", type=int, default=0, help="of these it is frozen, not killed (0)")
-    options.add_argument("--cut", type=int, default=0, help="of these a site's line to it is cut (0)")
+    options.add_argument("--merges", type=int, default=20, help="number of times that the relay fails and returns (20)")
+    options.add_argument("--frozen", type=int, default=0, help="of these, times that it is frozen, not killed (0)")
+    options.add_argument("--cut", type=int, default=0, help="of these, times that a site's line to it is cut (0)")
     options.add_argument("--down", type=float, default=10.0, help="seconds without a relay (10)")
     options.add_argument("--grants", type=int, default=200, help="grants of each kind (200)")
     options.add_argument("--kills", type=int, default=10, help="holders killed (10)")

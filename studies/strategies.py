@@ -1,8 +1,8 @@
-"""`python -m studies strategies`: what each strategy gets into use, and what it takes.
+"""`python -m studies strategies`: the number of RCs that each strategy gets into use, and its time.
 
-The paper's experiment (10 RCs, 20 ARCs of 1 to 5, all at once), then larger ones, where CP-SAT says what is
-possible. Each strategy decides in a core, as in the RCM: from the ARCs' asking to the pass after which
-nothing more is to be done. Times are CPU times of this process, so that a busy machine counts less.
+The paper's experiment (10 RCs, 20 ARCs of 1 to 5, all at once), then larger experiments, compared with the best set of
+CP-SAT. Each strategy decides in a core, as in the RCM: from the requests to the last pass. Times are CPU times of this
+process, so that a busy machine matters less.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ PAPER = {"optimal": 39.3, "priority": 0.59}
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """One strategy on one size. Shares are RCs in use by the best, or by the most that could be."""
+    """A strategy at one size. Shares are RCs in use, divided by the best possible number."""
 
     size: str
     strategy: str
@@ -50,11 +50,11 @@ class Decided:
     in_use: int
     seconds: float
     longest: float
-    """The longest single pass, in seconds: for so long the RCM would not answer."""
+    """The longest single pass in seconds, during which the RCM would not answer."""
 
 
 def experiment(seed: int, rcs: int, arcs: int) -> list[ArcRequest]:
-    """ARCs of one priority that need 1 to 5 RCs each, and run as long as each other."""
+    """ARCs of the same priority and runtime that need 1 to 5 RCs each."""
     draw = random.Random(seed)  # noqa: S311
     return [
         ArcRequest(f"a{number}", "host/a", {f"rc/{rc}": {} for rc in needs}, 1, SECOND)
@@ -64,13 +64,13 @@ def experiment(seed: int, rcs: int, arcs: int) -> list[ArcRequest]:
 
 
 def problem(requests: list[ArcRequest]) -> PackingProblem:
-    """The same as the packer sees it."""
+    """The requests as a problem for the packer."""
     masks = [sum(1 << int(rc.split("/")[1]) for rc in request.needs) for request in requests]
     return PackingProblem([PackingItem(mask, mask.bit_count(), 0) for mask in masks])
 
 
 def decide(strategy: str, rcs: int, requests: list[ArcRequest]) -> Decided:
-    """Lets a strategy share out free RCs."""
+    """Let a strategy assign free RCs."""
     core = Core(STRATEGIES[strategy]())  # type: ignore[index]
     core.handle(0, *(RcJoined(f"rc/{number}", False) for number in range(rcs)))
     batch: list[Event] = [Requested(request) for request in requests]
@@ -85,7 +85,7 @@ def decide(strategy: str, rcs: int, requests: list[ArcRequest]) -> Decided:
 
 
 def rows(rcs: int, arcs: int, seeds: int, best: list[float], names: tuple[str, ...], paper: bool = False) -> list[Row]:
-    """Measures each strategy; `best` is what each seed's shares are taken of."""
+    """Measure each strategy. `best`: the best number of RCs by seed, for the shares."""
     found = []
     for name in names:
         runs = [decide(name, rcs, experiment(seed, rcs, arcs)) for seed in range(seeds)]
@@ -109,7 +109,7 @@ def rows(rcs: int, arcs: int, seeds: int, best: list[float], names: tuple[str, .
 
 
 def solved(rcs: int, arcs: int, seeds: int, seconds: float) -> list[float]:
-    """The best that CP-SAT finds in so many seconds, on all cores."""
+    """The best number of RCs by seed that CP-SAT finds within `seconds`, on all cores."""
     return [float(reference(problem(experiment(seed, rcs, arcs)), seconds)) for seed in range(seeds)]
 
 
@@ -134,7 +134,7 @@ def reference(packing: PackingProblem, seconds: float) -> int:
 
 
 def border(seeds: int) -> list[dict[str, Any]]:
-    """How much branch and bound takes against CP-SAT, by size."""
+    """Times of branch and bound compared with CP-SAT, by size."""
     found = []
     for rcs, arcs in ((10, 20), (15, 30), (20, 40), (30, 60), (40, 80), (50, 100)):
         cases = [problem(experiment(seed, rcs, arcs)) for seed in range(seeds)]
@@ -181,9 +181,9 @@ def table(measured: list[Row], borders: list[dict[str, Any]]) -> str:
     ]
     lines += ["", f"{'size':<9}{'branch and bound':>18}{'worst':>11}{'proven':>8}{'CP-SAT':>12}"]
     lines += [
-        f"{one['size']:<9}{one['branch_ms']:>15.2f} ms{one['branch_worst_ms']:>8.1f} ms{one['proven']:>8.0%}"
-        + (f"{one['cpsat_ms']:>9.1f} ms" if one["cpsat_ms"] is not None else "")
-        for one in borders
+        f"{size['size']:<9}{size['branch_ms']:>15.2f} ms{size['branch_worst_ms']:>8.1f} ms{size['proven']:>8.0%}"
+        + (f"{size['cpsat_ms']:>9.1f} ms" if size["cpsat_ms"] is not None else "")
+        for size in borders
     ]
     return "\n".join(lines)
 
@@ -192,7 +192,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m studies strategies", description=__doc__)
     parser.add_argument("--json", action="store_true", help="print one JSON object instead of a table")
     parser.add_argument("--seeds", type=int, default=100, help="of the paper's experiment (default: 100)")
-    parser.add_argument("--large", type=int, default=5, help="seeds of the larger ones (default: 5)")
+    parser.add_argument("--large", type=int, default=5, help="seeds of the larger experiments (default: 5)")
     parser.add_argument("--solver", type=float, default=60, help="seconds for CP-SAT at 300x600 (default: 60)")
     args = parser.parse_args()
     if args.seeds < 1 or args.large < 1 or args.solver <= 0:
@@ -201,7 +201,7 @@ def main() -> None:
     loop = additions()
     names = tuple(STRATEGIES)
     small = [problem(experiment(seed, 10, 20)) for seed in range(args.seeds)]
-    best = [float(one.value(pack(one).chosen)) for one in small]
+    best = [float(case.value(pack(case).chosen)) for case in small]
     measured = rows(10, 20, args.seeds, best, names, paper=True)
     if optimal.solver_available():
         for rcs, arcs, seconds in ((50, 100, 20.0), (300, 600, args.solver)):
@@ -227,4 +227,4 @@ def main() -> None:
         f"time.\nA loop of a million additions took {loop:.0f} ms; some 50 on a quiet machine."
     )
     if not optimal.solver_available():
-        print("Without OR-tools (the extra `optimal`) nothing says what is possible at larger sizes.")
+        print("Without OR-tools (the extra `optimal`) there are no larger sizes: their best sets are unknown.")

@@ -1,6 +1,6 @@
-"""What the quick tier of the suite can notice: which guards of the protocol, and which lines and branches.
+"""The reach of the suite's quick tier: the guards of the protocol, lines and branches that it notices.
 
-As a plugin of pytest (`-p studies.suite`) this module takes the guard out that $ZSCOUT_WITHOUT names."""
+As a plugin of pytest (`-p studies.suite`) this module removes the guard named by $ZSCOUT_WITHOUT."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ IN_PROCESS: Final = (
     "tests/drivers",
     "tests/scheduling",
 )
-"""Folders whose tests run guarded code in their own process, where a guard can be taken out."""
+"""Folders whose tests run guarded code in their own process, where a guard can be removed."""
 ROOMS: Final = ("scheduling", "services", "drivers", "behaviors")
 SUMMED: Final = ("covered_lines", "num_statements", "covered_branches", "num_branches")
 """Of the summary of a file in a report of coverage.py."""
@@ -67,7 +67,7 @@ def guards() -> None:
         first = failed[0].split(maxsplit=1)[1].partition(" - ")[0] if failed else "-"
         rows.append([name, first, f"{time.monotonic() - began:.0f} s"])
         print_line(f"{name}: {rows[-1][1]}", sys.stderr)
-    print_table(["guard taken out", "noticed first by", "after"], rows)
+    print_table(["removed guard", "noticed first by", "after"], rows)
     print_line(f"{sum(row[1] != '-' for row in rows)} of {len(rows)} guards are noticed by the quick tier")
 
 

@@ -1,5 +1,5 @@
-"""`python -m studies viewer`: how long a browser takes until it shows the whole of a recording, what a recorder
-needs, and what is kept of an hour of four cameras."""
+"""`python -m studies viewer`: the time until a browser shows a whole recording, the memory of a recorder, and the size
+of an hour of four cameras."""
 
 from __future__ import annotations
 
@@ -33,10 +33,10 @@ from zscout.services.recorder.timeline import Timeline
 
 MEGA = 1e6
 QUIET = 20.0
-"""Seconds in which nothing changes any more: then all is there."""
+"""A page without changes for this many seconds is complete."""
 PATIENCE = 400.0
 SETTLED = 10.0
-"""Seconds after which a process has all that it needs in memory."""
+"""Seconds after which the memory of a process is measured."""
 CAMERAS = 4
 RATE = 2.0
 """Pictures a second."""
@@ -57,7 +57,7 @@ def progress(text: str) -> None:
 
 
 class Repeated(Timeline):
-    """A run that is told several times, one after the other."""
+    """A run that is recorded several times in succession."""
 
     shift = 0.0
 
@@ -69,10 +69,10 @@ class Repeated(Timeline):
 
 
 class Measured(Timeline):
-    """Tells what finishing took."""
+    """Measures the finishing of the recording."""
 
     written = seconds = 0.0
-    """MB before, and how long it took."""
+    """MB before finishing, and its duration."""
 
     def _finish(self, path: Path, layout: Layout) -> None:
         self.written = path.stat().st_size / MEGA
@@ -82,15 +82,15 @@ class Measured(Timeline):
 
 
 class Unfinished(Repeated):
-    """Stays as it was written."""
+    """A recording without finishing."""
 
     def _finish(self, path: Path, layout: Layout) -> None:
         pass
 
 
 def record(path: Path, megabytes: float, kind: type[Repeated] = Repeated) -> None:
-    """A recording of four robots at work, with cameras, floor, loads and events, of about this size; with 0 megabytes
-    the first instant of it: all panes, and nothing in them."""
+    """Write a recording of four robots at work, with cameras, floor, loads and events, of about this size. With 0
+    megabytes only its first instant: all panes, but empty."""
     with kind("lab", path=path) as timeline:
         while True:
             timeline.robots = RobotTracker(timeline)
@@ -102,19 +102,19 @@ def record(path: Path, megabytes: float, kind: type[Repeated] = Repeated) -> Non
 
 
 def record_finished(path: Path, megabytes: float) -> float:
-    """The same, but of this size once it is finished; returns how large it was before."""
+    """The same, but with this size after finishing. Return the size before."""
     written = megabytes
     while True:
         record(path, written)
         size = path.stat().st_size / MEGA
         if size >= megabytes:
             return written
-        # Finishing thins and packs.
+        # Finishing thins out and compresses.
         written *= 1.02 * megabytes / size
 
 
 async def seconds_until_whole(program: str, recording: Path, picture: Path) -> float:
-    """From the page being opened to the first picture that stays."""
+    """Seconds from the opening of the page to the first picture that does not change any more."""
     async with open_viewer(Recording(str(recording), None), web=True) as (_, address):
         assert address is not None
         return await asyncio.to_thread(_watch, program, address, picture)
@@ -139,7 +139,7 @@ def _watch(program: str, address: str, picture: Path) -> float:
 
 
 async def browser(program: str, folder: Path, megabytes: float, rounds: int, pictures: Path) -> list[Row]:
-    """An empty recording, and one of this size, in turn; the same as it was written, for the difference."""
+    """Measure an empty recording and a recording of this size, in turn; and the latter without finishing."""
     empty, whole, written = (folder / f"{name}.rrd" for name in ("empty", "whole", "written"))
     record(empty, 0)
     record(written, record_finished(whole, megabytes), Unfinished)
@@ -168,7 +168,7 @@ def _resident(process: subprocess.Popen[bytes]) -> float:
 
 
 def memory(folder: Path) -> list[Row]:
-    """A recorder that has joined an empty mesh, and a process that has Rerun, a server and a file and nothing else."""
+    """Memory of a recorder on an empty mesh, and of a process with only Rerun, a server and a file."""
     fleet = default_fleet()
     mesh = MeshConfig(multicast=False, listen=("tcp/127.0.0.1:0",))
     job = RecorderJob(
@@ -179,13 +179,13 @@ def memory(folder: Path) -> list[Row]:
         "recorder": ([sys.executable, "-m", "zscout.services.recorder"], encode_job(job)),
     }
     sizes = {}
-    for name, (command, told) in commands.items():
+    for name, (command, job_input) in commands.items():
         process = subprocess.Popen(
             command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, env=os.environ
         )
         assert process.stdin is not None
         assert process.stdout is not None
-        process.stdin.write(told)
+        process.stdin.write(job_input)
         process.stdin.flush()
         assert process.stdout.readline()
         sizes[name] = _resident(process)
@@ -200,7 +200,7 @@ def memory(folder: Path) -> list[Row]:
 
 
 def hour(folder: Path) -> list[Row]:
-    """Four cameras for an hour: what is written, and what is kept of it."""
+    """An hour of four cameras: its size as written, and after finishing."""
     written = folder / "cameras.rrd"
     pictures = [_sized(robot_run.jpeg(number / 7, "scout33", None)) for number in range(100)]
     with Measured("lab", path=written) as timeline:
@@ -217,7 +217,7 @@ def hour(folder: Path) -> list[Row]:
 
 
 def _sized(jpeg: bytes) -> bytes:
-    """Of about the size of a robot's picture; a decoder stops at the end of the picture."""
+    """Pad a picture to about the size of a robot's picture; a decoder stops at the picture's end."""
     return jpeg + bytes(max(0, PICTURE - len(jpeg)))
 
 
@@ -226,8 +226,8 @@ def main() -> None:
     parser.add_argument("--json", action="store_true", help="print one JSON object instead of a table")
     parser.add_argument("--megabytes", type=float, default=10.0, help="of the recording (default: 10)")
     parser.add_argument("--rounds", type=int, default=3, help="of the browser (default: 3)")
-    parser.add_argument("--pictures", type=Path, default=None, help="a folder for what the browser shows")
-    parser.add_argument("--no-browser", action="store_true", help="only what needs none")
+    parser.add_argument("--pictures", type=Path, default=None, help="a folder for pictures of the browser")
+    parser.add_argument("--no-browser", action="store_true", help="skip the measurements with a browser")
     args = parser.parse_args()
     load, program, rows = os.getloadavg()[0], find(), list[Row]()
     with tempfile.TemporaryDirectory(prefix="zscout-viewer-") as name:

@@ -1,8 +1,8 @@
-"""`python -m studies watching`: how well the motion detector watches, in simulated buildings and on real
-recordings whose truth was looked up by hand.
+"""`python -m studies watching`: the quality of the motion detector, in simulated buildings and on real recordings with
+manually determined truth.
 
-A robot hides at random in a dark place of each building from which it faces the light; people walk by,
-and the detector looks at what its receiver gives, at 5 pictures a second and three levels of noise.
+A robot hides in a random dark place of each building, facing the light. People walk by, and the detector gets its
+receiver's pictures, at 5 a second and three levels of noise.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ def _rows(name: str, watched: Watched) -> Iterator[Row]:
 
 
 def recorded() -> Iterator[Row]:
-    """What becomes of real recordings; nothing where opencv-doc is not installed."""
+    """Rows of the real recordings; none if opencv-doc is not installed."""
     if not (PASSERS_BY.exists() and GARDEN.exists()):
         print("no real recordings: install Debian's opencv-doc", file=sys.stderr)
         return
@@ -89,17 +89,17 @@ def recorded() -> Iterator[Row]:
         if number in PEOPLE:
             there = PEOPLE[number]
             people += len(there)
-            found += sum(max((covered(one, box) for box in seen.boxes), default=0) >= 0.5 for one in there)
+            found += sum(max((covered(person, box) for box in seen.boxes), default=0) >= 0.5 for person in there)
             boxes += len(seen.boxes)
-            empty += sum(not any(covered(one, box) >= 0.25 for one in there) for box in seen.boxes)
+            empty += sum(not any(covered(person, box) >= 0.25 for person in there) for box in seen.boxes)
     yield Row("passers-by: pictures with motion", 100 * moving / count, "%", rounds=count)
     yield Row("passers-by: people in a box", 100 * found / people, "%", rounds=people)
-    yield Row("passers-by: boxes with nobody", 100 * empty / boxes, "%", rounds=boxes)
+    yield Row("passers-by: boxes without people", 100 * empty / boxes, "%", rounds=boxes)
     yield Row("empty lawn: pictures with motion", 100 * on_lawn / lawn_count, "%", rounds=lawn_count)
     detector = MotionDetector()
-    told = [(time, detector.see(time, picture).moving) for time, picture in pictures(GARDEN)]
-    before = [moves for time, moves in told if time < HAND]
-    after = [moves for time, moves in told if time >= HAND]
+    garden = [(time, detector.see(time, picture).moving) for time, picture in pictures(GARDEN)]
+    before = [moves for time, moves in garden if time < HAND]
+    after = [moves for time, moves in garden if time >= HAND]
     yield Row("tree in the wind: pictures with motion", 100 * sum(before) / len(before), "%", rounds=len(before))
     yield Row("hand before it: pictures with motion", 100 * sum(after) / len(after), "%", rounds=len(after))
 
@@ -117,15 +117,15 @@ def main() -> None:
     if not set(buildings) <= set(known):
         parser.error(f"buildings are {', '.join(known)}")
     if args.seeds < 0 or args.jobs < 1 or args.seconds <= 0:
-        parser.error("no fewer than 0 seeds (0: the recordings alone) and 1 job, for more than 0 seconds")
-    # Before the processes start, which have it from here.
+        parser.error("give at least 0 seeds (0: only the recordings), at least 1 job, and more than 0 seconds")
+    # Set before the processes start, because they inherit it.
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     sums = simulated(buildings, args.seeds, args.seconds, args.jobs)
     rows = [*rows_of(sums), *recorded()]
     if args.json:
-        told: list[Any] = [
+        simulations: list[Any] = [
             {"building": building, "noise": noise, **asdict(watched)} for (building, noise), watched in sums.items()
         ]
-        print(json.dumps({"rows": [row.as_json() for row in rows], "simulated": told}))
+        print(json.dumps({"rows": [row.as_json() for row in rows], "simulated": simulations}))
     else:
         print(table(rows))

@@ -31,7 +31,7 @@ HEADLESS = (
 )
 """A clause without its noun: who holds it, what was asked."""
 PLAIN = [
-    *("studies/chaos", "studies/faults", "studies/placement", "studies/scheduling"),
+    "studies",
     *("zscout/behaviors", "zscout/cli", "zscout/drivers"),
     *("zscout/components", "zscout/config", "zscout/placement", "zscout/simulation", "zscout/testing"),
     *("zscout/mesh", "zscout/messages", "zscout/services/bookings", "zscout/services/node"),

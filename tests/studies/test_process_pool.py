@@ -65,7 +65,7 @@ def test_bad_input_stays_bad_input() -> None:
 
 @pytest.mark.parametrize(("work", "job"), [(os._exit, 3), (killed_in_the_middle_of_its_answer, 100_000_000)])
 def test_a_process_that_dies_ends_it(work: Callable[[int], Any], job: int) -> None:
-    with pytest.raises(Failed, match="died, perhaps for want of memory; use fewer with --jobs 1"):
+    with pytest.raises(Failed, match="died, perhaps because memory ran out; use fewer with --jobs 1"):
         collected(work, [job, job])
     assert multiprocessing.active_children() == []
 

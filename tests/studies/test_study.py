@@ -204,7 +204,7 @@ def changes(path: Path) -> Iterator[tuple[str, float]]:
     [
         ("schedule", ["--seeds", "0"], '--seeds: "0" is an empty range of seeds'),
         ("schedule", ["--seeds", "9-5"], "is an empty range of seeds"),
-        ("schedule", ["--seeds", "many"], "write how many, as in 20"),
+        ("schedule", ["--seeds", "many"], "write a number, as in 20"),
         ("schedule", ["--seeds", f"{MAX_SEED}-{MAX_SEED + 1}"], f"a seed is at most {MAX_SEED}"),
         ("schedule", ["--seeds", "100000"], "are more than 5000; ask for fewer seeds or families"),
         ("schedule", ["--family", "nothing"], '"nothing" is unknown; write one of'),
