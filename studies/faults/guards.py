@@ -349,24 +349,31 @@ GUARDS: Final[Mapping[str, Guard]] = MappingProxyType(
         ),
         "unbooked": Guard("a booking that was given up stays so", {(records, "merged"): _unbooked_by_newer}),
         "dates": Guard("a date that was given up, or is over, stays so", {(records, "merged"): _dates_of_newer}),
-        "merged": Guard("a host's records are one source among all", {(records, "merged"): _believed}),
+        "merged": Guard("a host's copy is one source among all", {(records, "merged"): _believed}),
         "copied": Guard("a booking is acknowledged when another host has it", {(BookingSharing, "keep"): _keep_later}),
         "caught up": Guard(
-            "a keeper that joins later receives all records",
+            "a host that comes later receives all facts",
             {(BookingSharing, "_on_token"): _nothing, (BookingSharing, "_behind"): NEVER},
         ),
         "late": Guard("a late publication turns no clock back", {(BookingKeeper, "observe"): _hear_any}),
         "fleet time": Guard("a leader continues the fleet's time", {(bookings, "_time"): _own_wall}),
-        "steady": Guard("fleet time moves only where most clocks differ from it", {(FleetClock, "correct"): _follow}),
+        "steady": Guard(
+            "fleet time moves only where most clocks differ from it by more than 2 s",
+            {(FleetClock, "correct"): _follow},
+        ),
         "dates first": Guard(
             "a leader knows of all dates before it grants",
             {(Bookings, "recovered"): _none_recovered, (Rcm, "enter"): _do_nothing},
         ),
         "one stands": Guard(
-            "of two bookings that exclude each other one stands", {(Calendar, "_obstacle"): _no_obstacle}
+            "of two bookings that exclude each other only one counts", {(Calendar, "_obstacle"): _no_obstacle}
         ),
-        "awaited": Guard("an ARC with a date does not begin before it", {(BookedDates, "dated"): _undated}),
-        "had again": Guard("an ARC with a lost date gets it again once possible", {(Calendar, "_offer"): _nothing}),
+        "awaited": Guard(
+            "an ARC that has taken up a date does not begin before it", {(BookedDates, "dated"): _undated}
+        ),
+        "had again": Guard(
+            "an ARC that has taken up a date gets it back once possible", {(Calendar, "_offer"): _nothing}
+        ),
         "budget": Guard(
             "an ARC that has spent its budget is preempted by operators only", {(Arc, "protected_below"): _nothing}
         ),
