@@ -90,6 +90,7 @@ PLAIN_ONLY: Final[dict[str, str]] = {
     "live/test_forgeries.py": _FORGES,
     "live/test_plain_doors.py": _FORGES,
     "deploy/test_units.py": "systemd's units run as they are shipped; test_install_host makes those of a secured host",
+    "docs/test_coming_from_labgrid.py": "a user releases another's board, as only operators may with rights",
     "live/test_versions.py": "version 0.1.0 knows no [security]",
 }
 """Modules, and why they have no secured fleet."""

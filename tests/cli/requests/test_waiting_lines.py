@@ -37,7 +37,9 @@ START = rf"starts at {CLOCK} \(in 20 min\)"
 News = tuple[str, ReasonInfo, int]
 
 
-def printed(monkeypatch: pytest.MonkeyPatch, *courses: News, as_json: bool = False, pause: float = 0.0) -> list[str]:
+def printed(
+    monkeypatch: pytest.MonkeyPatch, *courses: News, as_json: bool = False, pause: float = 0.1, quiet: bool = False
+) -> list[str]:
     """The lines for what a waiting request learns, one after the other."""
     monkeypatch.setattr(request, "REFRESH_INTERVAL_S", 0.02)
     out, looks = io.StringIO(), 0
@@ -56,11 +58,11 @@ def printed(monkeypatch: pytest.MonkeyPatch, *courses: News, as_json: bool = Fal
         arc = OpenArc("b1", "next", {"gpu/0": {}}, 0, Decimal(60), keep=True)
         arc.state, arc.since = "queued", now()
         with Report("next", cast("Client", client), as_json=as_json, stream=out) as report:
-            async with report.following(report.follow_wait()):
+            async with report.following(report.follow_wait(quiet=quiet)):
                 for arc.reason, arc.why, arc.ahead in courses:
                     arc._notified_at, arc.start = now(), now() + 1200 * SECOND
                     report.news(arc)
-                    await asyncio.sleep(pause or 0.1)
+                    await asyncio.sleep(pause)
 
     asyncio.run(wait())
     return out.getvalue().splitlines()
@@ -85,6 +87,11 @@ def test_a_new_place_in_the_queue_does_not_repeat_the_reason(monkeypatch: pytest
     first, then = printed(monkeypatch, BEHIND_ONE, BY_TRAIN)
     assert re.fullmatch(f"{LINE}; 1 ahead; {START}", first)
     assert re.fullmatch(f"next waits: nobody ahead; {START}", then)
+
+
+def test_who_tries_once_reads_the_reason_in_the_error_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert printed(monkeypatch, BY_TRAIN, quiet=True) == []
+    assert len(printed(monkeypatch, BY_TRAIN, quiet=True, as_json=True)) == 1
 
 
 def test_programs_get_the_holders(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -164,7 +164,7 @@ async def wait_for_grant(client: Client, wanted: HoldOptions, report: Report, ar
     try:
         once = wanted.timeout == 0
         async with (
-            report.following(report.follow_wait()),
+            report.following(report.follow_wait(quiet=once)),
             asyncio.timeout(ANSWER_TIMEOUT_S if once else wanted.timeout) as limit,
         ):
             if arc is None:
@@ -499,7 +499,8 @@ class Report(LiveLine):
         finally:
             self.hide()
 
-    async def follow_wait(self) -> None:
+    async def follow_wait(self, *, quiet: bool = False) -> None:
+        """Show why it waits. `quiet`: as events only, since an error will name the reason."""
         self._printed = None
         while True:
             if self._fetched_at is not None and self._arc is not None and self._arc.state == "queued":
@@ -519,7 +520,7 @@ class Report(LiveLine):
                     self._fetched_at, self._fetched_for = self._mesh.now(), arc._last
                     self._state = await self._client.state()
                 if arc.state in ("asking", "queued"):
-                    self._show_wait(arc)
+                    self._show_wait(arc, quiet=quiet)
             await done_within(REFRESH_INTERVAL_S if self.watched else None, self.changed.wait())
 
     async def follow_hold(self, arc: OpenArc) -> None:
@@ -539,7 +540,7 @@ class Report(LiveLine):
             self.draw(f"{arc.name} holds {held_text(arc)}: {rest}\n  Ctrl-C gives back")
             await done_within(REFRESH_INTERVAL_S if self.watched else None, self.changed.wait())
 
-    def _show_wait(self, arc: OpenArc) -> None:
+    def _show_wait(self, arc: OpenArc, *, quiet: bool) -> None:
         now, start, starts_in, me = self._mesh.now(), "", None, User.of(self._client)
         needs: list[NeedContention] = []
         if arc.start is not None:
@@ -572,7 +573,7 @@ class Report(LiveLine):
         before, self._printed = self._printed, _how(arc)
         if before is not None and before[:2] == self._printed[:2]:  # one line for each reason
             words, ahead = f"{arc.name} waits: {ahead or 'nobody ahead'}", ""
-        text = "; ".join(filter(None, (words, ahead, start)))
+        text = "" if quiet else "; ".join(filter(None, (words, ahead, start)))
         contention = [need.as_json() for need in needs]
         self.event(
             "waits",
