@@ -13,7 +13,7 @@ import sys
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from datetime import datetime, timedelta
+from datetime import datetime
 from decimal import Decimal
 from itertools import zip_longest
 from operator import gt
@@ -24,6 +24,7 @@ import msgspec
 from zscout.streams import escaped, writable
 from zscout.types import clean as clean
 from zscout.types import span as span
+from zscout.types import whole_second
 
 if TYPE_CHECKING:
     from rich.console import Console, Group, RenderableType
@@ -91,10 +92,10 @@ def clock(seconds: float) -> str:
     """The time of day `seconds` from now (negative: ago), as this host's clock shows it in that instant: `14:32`,
     `14:32:05` within two minutes of now, with the date on another day.
 
-    Rounded to the nearest second, then down to the minute: an instant has one time, before and after it."""
+    Rounded by `whole_second`, then down to the minute: an instant has one time, before and after it."""
     now = datetime.now().astimezone()
-    away = timedelta(seconds=max(-MAX_CLOCK_S, min(seconds, MAX_CLOCK_S)) + 0.5)
-    at = (now + away).replace(microsecond=0).astimezone()
+    away = max(-MAX_CLOCK_S, min(seconds, MAX_CLOCK_S))
+    at = datetime.fromtimestamp(whole_second(now.timestamp() + away)).astimezone()
     time = f"{at:%H:%M:%S}" if abs(seconds) < NEAR_S else f"{at:%H:%M}"
     if at.date() == now.date():
         return time

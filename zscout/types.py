@@ -5,6 +5,7 @@ sums are exact (0.1 + 0.2 is 0.3)."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from fractions import Fraction
 from typing import Final, Literal, NamedTuple, TypeAlias
@@ -58,6 +59,11 @@ def span(seconds: float) -> str:
             rest = whole % big // small
             return f"{whole // big} {big_unit}" + (f" {rest} {small_unit}" if rest else "")
     return f"{whole} s"
+
+
+def whole_second(at: float) -> int:
+    """The nearest second: the rounding of each date and time of day that people read, before its minute is taken."""
+    return math.floor(at + 0.5)
 
 
 class Term(NamedTuple):

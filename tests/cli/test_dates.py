@@ -184,6 +184,7 @@ def test_words() -> None:
     ]
     start = datetime(2026, 12, 1, 14, 0, tzinfo=BERLIN).timestamp()
     assert date_words(start, NEW_YORK) == "Tue 2026-12-01 08:00"
+    assert {date_words(start + late, BERLIN) for late in (-0.2, 0.2)} == {"Tue 2026-12-01 14:00"}
     assert span_words(start, start + 7200, BERLIN) == "Tue 2026-12-01 14:00 to 16:00"
     assert span_words(start, start + 86_400 + 5, BERLIN) == "Tue 2026-12-01 14:00 to Wed 2026-12-02 14:00:05"
     # As clocks are put back its end is by the clock where it began.

@@ -7,11 +7,14 @@ from collections.abc import Iterator
 from datetime import datetime, timedelta, tzinfo
 from decimal import Decimal
 from typing import Self
+from zoneinfo import ZoneInfo
 
 import msgspec
 import pytest
 
 from zscout import terminal
+from zscout.cli import journals
+from zscout.cli.dates import date_words
 from zscout.cli.ownership import User
 from zscout.cli.requests.waiting import hold_text, reason_text, whose
 from zscout.messages import HoldView, ReasonInfo, ReasonParty, Who
@@ -84,6 +87,15 @@ def test_an_instant_has_one_time_before_and_after_it(
     instant = datetime(2026, 3, 9, 14, 12)  # noqa: DTZ001 - this host's own clock
     stop_at(monkeypatch, instant - timedelta(seconds=away))
     assert clock(away + delay) == ("14:12:00" if abs(away + delay) < NEAR_S else "14:12")
+
+
+@pytest.mark.parametrize("late", [-0.6, -0.2, 0, 0.2, 0.6])
+def test_a_past_date_has_the_time_that_the_clock_had(late: float) -> None:
+    """In the journals, in a zone and as a time of day: rounded alike."""
+    ago = 1950 - late
+    at = NOW.timestamp() - ago
+    journal, there, here = journals.local(at), date_words(at, ZoneInfo("Europe/Berlin")), clock(-ago)
+    assert journal.split()[1][:5] == there.split()[2][:5] == here
 
 
 def hold(*, keep: bool, remaining: float, priority: int = 1, who: Who | None = None) -> HoldView:

@@ -20,6 +20,7 @@ from zoneinfo import ZoneInfo, available_timezones
 
 from zscout.config.strict import BadInput, parse_duration, quoted
 from zscout.messages.bookings import DAYS, MAX_AHEAD
+from zscout.types import whole_second
 
 DATE_FORMS: Final = (
     '"now", "tue 14:00", "tomorrow 9:00", "14:30", "2026-12-01 14:00", "2026-12-01T14:00+01:00" or "in 2h"'
@@ -233,13 +234,13 @@ def in_zone(at: float, zone: ZoneInfo | None) -> datetime:
 
 
 def date_words(at: float, zone: ZoneInfo | None) -> str:
-    there = in_zone(at, zone)
+    there = in_zone(whole_second(at), zone)
     return f"{there:%a %Y-%m-%d %H:%M}" + (f":{there:%S}" if there.second else "")
 
 
 def span_words(start: float, end: float, zone: ZoneInfo | None) -> str:
     """`Tue 2026-12-01 14:00 to 16:00`; with the end's UTC offset if clocks change between them on the same day."""
-    first, last, words = in_zone(start, zone), in_zone(end, zone), date_words(end, zone)
+    first, last, words = in_zone(start, zone), in_zone(whole_second(end), zone), date_words(end, zone)
     if first.date() == last.date():
         words = words.split()[-1] + (last.isoformat()[-6:] if first.utcoffset() != last.utcoffset() else "")
     return f"{date_words(start, zone)} to {words}"

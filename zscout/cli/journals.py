@@ -20,6 +20,7 @@ from zscout.messages import MAX_ASKED_NAMES, HistoryAsk, PastHold, ReasonParty
 from zscout.services.journal import asking
 from zscout.services.journal.asking import FleetHistory
 from zscout.terminal import Table, clean, span
+from zscout.types import whole_second
 
 if TYPE_CHECKING:
     from zscout.behaviors.client.client import Client
@@ -154,7 +155,7 @@ def utc(at: float) -> str:
 
 
 def local(at: float) -> str:
-    return f"{datetime.fromtimestamp(at).astimezone():%Y-%m-%d %H:%M:%S}"
+    return f"{datetime.fromtimestamp(whole_second(at)).astimezone():%Y-%m-%d %H:%M:%S}"
 
 
 def person(hold: PastHold, *, proven: bool) -> str:
