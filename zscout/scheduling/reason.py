@@ -228,6 +228,11 @@ def base(pattern: Need) -> Need:
     return pattern.partition("#")[0]
 
 
+def some_of(count: int) -> str:
+    """`two of`, before choices of which `count` are needed."""
+    return f"{_COUNTS.get(count, count)} of"
+
+
 _COUNTS: Final = dict(enumerate(("one", "two", "three", "four", "five", "six", "seven", "eight"), 1))
 
 
@@ -250,7 +255,7 @@ def _held(reason: Reason, until: Until | None) -> str:
             f"{rc} (held by {choice[1]}{_last(choice[1], until)})" for rc, choice in zip(names, choices, strict=True)
         ]
         missing = len({need for _, _, need in choices})
-        parts.append(f"{_COUNTS.get(missing, missing)} of {', '.join(shown)}")
+        parts.append(f"{some_of(missing)} {', '.join(shown)}")
     more = f" and {reason.number - len(held)} more" if reason.number > len(held) else ""
     preferred = f"; by fair shares {reason.detail} goes first" if reason.detail else ""
     return f"waits for {'; for '.join(parts)}{more}{preferred}"

@@ -220,6 +220,8 @@ def test_a_pattern_is_met_where_there_are_free_ones_enough(
         (["fg/a"], {"preempts": ["low"]}),
         (["fg/a$*"], {"preempts": ["low"]}),
         (["robot/*"], {"waits_for_one_of": {"robot/*": ["high", "peer"]}}),
+        (["robot/*", "robot/*#2"], {"waits_for_one_of": {key: ["high", "peer"] for key in ("robot/*", "robot/*#2")}}),
+        (["open/*", "open/*#2"], {"waits_for_one_of": {key: ["high", "peer"] for key in ("open/*", "open/*#2")}}),
         (["robot/r"], {"waits_for": ["high"]}),
         (["robot/r$*"], {"waits_for": ["high"]}),
         (["radio/*"], {"may_preempt": ["sharer"]}),
@@ -233,7 +235,7 @@ def test_what_taking_by_pattern_costs(needs: list[str], costs: dict[str, Any]) -
     seen = state(
         {
             "fg/a": "low", "fg/b": "peer", "robot/r": "high", "robot/s": "peer", "radio/f": "sharer",
-            "fg/c": "", "free/x": "", "free/y": "low",
+            "fg/c": "", "free/x": "", "free/y": "low", "open/x": "", "open/y": "high", "open/z": "peer",
         },
         absent=("fg/c",),
         priority={"high": 11, "peer": 10},
@@ -243,6 +245,7 @@ def test_what_taking_by_pattern_costs(needs: list[str], costs: dict[str, Any]) -
         timeout=None, grace=Decimal(1), command=(), again=False, as_json=True,
     )  # fmt: skip
     cost = takeover_cost(seen, wanted)
+    count = {"robot/*#2": "two"}.get(needs[-1], "one")
     told = cost.as_json()
     either = {need: [hold["arc"] for hold in holds] for need, holds in told.pop("waits_for_one_of").items()}
     absent = told.pop("absent")
@@ -250,5 +253,5 @@ def test_what_taking_by_pattern_costs(needs: list[str], costs: dict[str, Any]) -
     said |= {"waits_for_one_of": either, "absent": absent}
     assert {what: found for what, found in said.items() if found} == costs
     for need, holds in either.items():
-        (line,) = [line for line in cost.lines() if line.startswith("waits for one of ")]
+        (line,) = [line for line in cost.lines() if line.startswith(f"waits for {count} of ")]
         assert re.findall(r"(\w+) \([^()]*\), priority", line) == holds, need

@@ -23,6 +23,7 @@ from zscout.cli.requests.options import (
 from zscout.cli.requests.request import carry_out
 from zscout.cli.requests.waiting import contention_of, hold_json, hold_text
 from zscout.messages import HoldView, RcmState
+from zscout.scheduling.reason import base, some_of
 from zscout.terminal import clean, print_json, print_line
 
 
@@ -60,7 +61,7 @@ async def take(needs: Any, yes: bool, no_keep: bool, name: str | None, reason: s
 @dataclass(slots=True)
 class TakeoverCost:
     """The cost of taking devices for others: holds that end for certain, that may end, and that do not yield. `either`:
-    by pattern, holds of which one must end first."""
+    by pattern, holds of which one must end first; `missing`: by pattern without its number, how many of them."""
 
     priority: int
     """Priority of the request."""
@@ -68,6 +69,7 @@ class TakeoverCost:
     may_end: list[HoldView] = field(default_factory=list)
     stays: list[HoldView] = field(default_factory=list)
     either: dict[str, list[tuple[str, HoldView]]] = field(default_factory=dict)
+    missing: dict[str, int] = field(default_factory=dict)
     absent: list[str] = field(default_factory=list)
 
     def lines(self, me: User | None = None) -> list[str]:
@@ -79,8 +81,9 @@ class TakeoverCost:
             *(f"may take over from {text(hold)}: {', '.join(sorted(hold.needs))}" for hold in self.may_end),
             *(f"waits for {text(hold)}: {', '.join(sorted(hold.needs))}" for hold in self.stays),
             *(
-                f"waits for one of {', '.join(f'{rc} (held by {text(hold)})' for rc, hold in some)}"
-                for some in self.either.values()
+                f"waits for {some_of(max(1, self.missing[family]))} "
+                f"{', '.join(f'{rc} (held by {text(hold)})' for rc, hold in some)}"
+                for family, some in {base(need): some for need, some in self.either.items()}.items()
             ),
             *(f"waits for {rc}, which is not on the mesh" for rc in self.absent),
         ]
@@ -120,6 +123,8 @@ def takeover_cost(state: RcmState, wanted: HoldOptions) -> TakeoverCost:
                 _add(cost.stays, hold)
         elif keeps and not yields:
             cost.either[need.need] = keeps
+            family = base(need.need)
+            cost.missing[family] = cost.missing.get(family, -len(need.free)) + 1
     cost.may_end = [hold for hold in cost.may_end if hold not in cost.ends]
     return cost
 
