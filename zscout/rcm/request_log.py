@@ -358,8 +358,8 @@ class RequestLog:
     # Forecasts
 
     def starts(self, now: Ns) -> Mapping[ArcId, Ns]:
-        """By queued ARC: its start, forecast from the present state; absent: never, or too late. One forecast serves
-        the whole instant."""
+        """By queued ARC: its start, forecast from the present state; absent: not within the forecast. One
+        forecast serves the whole instant."""
         if self._forecast is None or self._forecast[0] != self._core.batches:
             self._starts = forecast(self._core, now, None, self._runtimes).starts
             self._forecast = self._core.batches, now

@@ -562,7 +562,7 @@ class Roster:
         for name, rc in list(self._rcs.items()):
             if rc.joined is not None and rc.joined.instance not in rc.tokens:
                 self._lose_rc(name)
-        # Requests that wait for a device never seen in this term get to know why it is absent.
+        # Gives requests for devices unseen in this term the reason for their absence.
         there = {name for name, rc in self._rcs.items() if rc.joined or rc.pending or rc.tokens or rc.departed}
         for name in sorted(self._devices.names - there):
             if not self._rcs[name].missed and (home := self._devices.latest_home(name)) is not None:
@@ -739,7 +739,7 @@ class Roster:
         if rc.joined is not None and overdue is not None and rc.joined.health == overdue[1]:
             self._take_report(rc, replace(rc.joined, health="ok"))
 
-    # What follows
+    # Helpers
 
     def _take_outbox(self) -> Outbox:
         out, self._out = self._out, Outbox()

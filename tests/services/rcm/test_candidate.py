@@ -22,7 +22,7 @@ from zscout.mesh.supervision import StallWatch
 from zscout.messages import LAST_TERMS, Cancel, Grants, Notice, OpenRequest, RcAsk, RcState, Release
 from zscout.services.rcm import candidate as candidate_module
 from zscout.services.rcm.candidate import Candidate
-from zscout.services.rcm.election import BACKOFF, MAX_BACKOFF, SETTLE
+from zscout.services.rcm.election import BACKOFF_S, JOIN_TIME, MAX_BACKOFF_S
 from zscout.types import NO_TERM, SECOND, Term
 
 
@@ -223,8 +223,8 @@ async def test_a_candidate_that_always_fails_tries_less_and_less(
     await asyncio.sleep(120)
     assert len(stood) == count
     gaps = [round(later - earlier) for earlier, later in pairwise(stood)]
-    assert gaps[:6] == [BACKOFF, 2, 4, 8, 16, MAX_BACKOFF]
-    assert set(gaps[6:]) == {MAX_BACKOFF}
+    assert gaps[:6] == [BACKOFF_S, 2, 4, 8, 16, MAX_BACKOFF_S]
+    assert set(gaps[6:]) == {MAX_BACKOFF_S}
 
 
 async def test_a_term_that_is_over_asks_nothing_more() -> None:
@@ -312,7 +312,7 @@ async def test_of_two_that_stand_at_once_one_leads_and_the_other_does_not(monkey
     names = itertools.chain(["1", "2", "x"], map(str, itertools.count(3)))
     monkeypatch.setattr(candidate_module, "new_instance", names.__next__)
     first = fleet.candidate("h2")
-    await asyncio.sleep(SETTLE / SECOND + 0.03)
+    await asyncio.sleep(JOIN_TIME / SECOND + 0.03)
     second = fleet.candidate("h1")
     await until(lambda: any(one.promise for one in late.asked))
     # The first waits for this promise; the second waits for nobody.

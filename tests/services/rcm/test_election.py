@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import pytest
 
-from zscout.services.rcm.election import CALM, RETRY, SETTLE, TURN, WAITS, Election, views
+from zscout.services.rcm.election import CALM, JOIN_TIME, LEADER_WAIT, RETRY, TURN, Election, views
 from zscout.types import SECOND, Ns, Term
 
 SILENCE = 2 * SECOND
@@ -45,21 +45,21 @@ def failed(now: Ns) -> Sight:
 @pytest.mark.parametrize(
     ("sights", "now", "due"),
     [
-        pytest.param([], START, START + SETTLE, id="nothing seen: after it has settled"),
-        pytest.param([candidate("b")], START, START + SETTLE, id="itself is no better candidate"),
-        pytest.param([candidate("a")], START, START + SETTLE + TURN, id="a better one goes first"),
-        pytest.param([candidate("c")], START, START + SETTLE, id="a worse one is not waited for"),
-        pytest.param([candidate("a"), candidate("a", alive=False)], START, START + SETTLE, id="a better one left"),
+        pytest.param([], START, START + JOIN_TIME, id="nothing seen: after it has settled"),
+        pytest.param([candidate("b")], START, START + JOIN_TIME, id="itself is no better candidate"),
+        pytest.param([candidate("a")], START, START + JOIN_TIME + TURN, id="a better one goes first"),
+        pytest.param([candidate("c")], START, START + JOIN_TIME, id="a worse one is not waited for"),
+        pytest.param([candidate("a"), candidate("a", alive=False)], START, START + JOIN_TIME, id="a better one left"),
         pytest.param(
             [candidate("a"), candidate("a"), candidate("a", alive=False)],
             START,
-            START + SETTLE + TURN,
+            START + JOIN_TIME + TURN,
             id="one of two lives of a better one is left",
         ),
-        pytest.param([candidate("z", alive=False)], START, START + SETTLE, id="somebody unknown left: no matter"),
+        pytest.param([candidate("z", alive=False)], START, START + JOIN_TIME, id="somebody unknown left: no matter"),
         pytest.param([came("x")], LATER, LATER + SILENCE, id="a leader: until it is silent for too long"),
         pytest.param([came("x"), heard("x", LATER + SECOND)], LATER, LATER + SECOND + SILENCE, id="it still speaks"),
-        pytest.param([heard("x", LATER)], LATER, START + SETTLE, id="words of one without a token count not"),
+        pytest.param([heard("x", LATER)], LATER, START + JOIN_TIME, id="words of one without a token count not"),
         pytest.param([came("x"), went("x", LATER + 5)], LATER + 5, LATER + 5, id="it died: at once"),
         pytest.param(
             [came("x", START + 2), went("x", START + 5)],
@@ -68,7 +68,7 @@ def failed(now: Ns) -> Sight:
             id="it died before this one had settled: who saw a leader is on the mesh",
         ),
         pytest.param([candidate("a"), came("x"), went("x", LATER)], LATER, LATER + TURN, id="it died: a better first"),
-        pytest.param([went("x", LATER)], LATER, START + SETTLE, id="a death of one never seen"),
+        pytest.param([went("x", LATER)], LATER, START + JOIN_TIME, id="a death of one never seen"),
         pytest.param(
             [came("x"), came("y", LATER + SECOND), went("x", LATER + 2 * SECOND)],
             LATER + 2 * SECOND,
@@ -79,7 +79,7 @@ def failed(now: Ns) -> Sight:
         pytest.param(
             [came("x"), heard("x", LATER)],
             LATER + SILENCE,
-            START + SETTLE,
+            START + JOIN_TIME,
             id="it keeps its token and says nothing: as if it were gone",
         ),
         pytest.param(
@@ -118,7 +118,7 @@ def test_without_a_ranking_hosts_take_turns_by_name() -> None:
         for other in ("a", "b", "c"):
             seen.candidate(other, alive=True, now=START)
         turns[host] = seen.next_try(START)
-    settled = START + SETTLE
+    settled = START + JOIN_TIME
     assert turns == {"a": settled, "b": settled + TURN, "c": settled + 2 * TURN}
 
 
@@ -277,7 +277,7 @@ def test_each_host_has_one_view(sights: list[tuple[str, bool]], others: tuple[in
     assert ((sum(found.values()), len(found)), of_this_host) == (others, own)
 
 
-BOUND = WAITS + SILENCE
+BOUND = LEADER_WAIT + SILENCE
 NOBODY: Sight = lambda _: None  # noqa: E731
 LAST = LATER + BOUND - 1
 

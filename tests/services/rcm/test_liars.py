@@ -16,7 +16,7 @@ from zscout.mesh import IncomingQuery
 from zscout.messages import MAX_COUNTER, ClientRequests, Grants, OpenRequest, RcAsk, RcState
 from zscout.rcm.places import Places
 from zscout.services.rcm.candidate import Candidate
-from zscout.services.rcm.election import WAITS
+from zscout.services.rcm.election import LEADER_WAIT
 from zscout.services.rcm.term_file import FILE, TermFile
 from zscout.types import NO_TERM, SECOND, Place, Term
 
@@ -186,7 +186,7 @@ async def test_many_rcs_of_one_host_that_see_a_leader_keep_nobody_from_leading(e
 async def test_a_host_that_alone_shows_a_leader_delays_one_change_of_leader_for_a_while() -> None:
     """It is not believed alone after that."""
     fleet = FakeFleet("h1", "h2", closed=True)
-    bound, silence = (WAITS + fleet.fleet.silence) / SECOND, fleet.fleet.silence / SECOND
+    bound, silence = (LEADER_WAIT + fleet.fleet.silence) / SECOND, fleet.fleet.silence / SECOND
     first, _ = fleet.candidate("h1"), liars(fleet, 3)
     await until(lambda: there(first), within=bound + SERVED)
     second = fleet.candidate("h2")
@@ -207,7 +207,7 @@ async def test_without_certificates_a_host_that_alone_shows_a_leader_is_believed
     await until(lambda: second.election.sees_leader(second.mesh.now()))
     rc.leader = True
     fleet.cut(first.mesh, second.mesh)
-    await asyncio.sleep(3 * WAITS / SECOND)
+    await asyncio.sleep(3 * LEADER_WAIT / SECOND)
     assert second.rcm is None
 
 

@@ -26,20 +26,20 @@ from zscout.types import SECOND, HostName, Ns, Term
 
 log = logging.getLogger(__name__)
 
-SHARE_EVERY: Final = 30.0
+SHARE_PERIOD_S: Final = 30.0
 """Seconds between questions to all keepers while nothing changes."""
-SHARE_AGAIN: Final = 5.0
+SHARE_AGAIN_S: Final = 5.0
 """Seconds between questions while some host differs."""
-GATHER: Final = 0.02
+GATHER_S: Final = 0.02
 """Seconds for which changes are gathered before they are shared."""
-TIMEOUT: Final = 2.0
+TIMEOUT_S: Final = 2.0
 PROMPT: Final[Ns] = SECOND
 """Only answers within this time are readings of a host's clock: later ones may have waited in a queue."""
-CLOCK_PERIOD: Final = 1.0
+CLOCK_PERIOD_S: Final = 1.0
 """Seconds between checks of the own clock: if it was set, all hosts are asked for theirs."""
 STEADY: Final[Ns] = 600 * SECOND
 """Records are forgotten only if fleet time was not set for this long, as it may be days ahead at first."""
-LOOK: Final = 0.5
+FIND_CANDIDATES_S: Final = 0.5
 """Seconds for finding the tokens of other candidates."""
 
 
@@ -159,12 +159,12 @@ class BookingSharing:
             before, ahead = ahead, wall_ns(self._keeper.wall()) - self._mesh.now()
             if before is not None and abs(ahead - before) > DIFFERS * SECOND:
                 self._news.set()
-            await asyncio.sleep(CLOCK_PERIOD)
+            await asyncio.sleep(CLOCK_PERIOD_S)
 
     async def _keep_sharing(self) -> None:
         while True:
-            if await done_within(SHARE_AGAIN if self._behind else SHARE_EVERY, self._news.wait()):
-                await asyncio.sleep(GATHER)
+            if await done_within(SHARE_AGAIN_S if self._behind else SHARE_PERIOD_S, self._news.wait()):
+                await asyncio.sleep(GATHER_S)
             self._news.clear()
             async with self._sharing:
                 why = await self._share()
@@ -183,13 +183,13 @@ class BookingSharing:
         records = list(keeper.records) if self._behind else list(sent.values())
         question = ShareBookings(self._term, keeper.records.digest(), records, time)
         saved, replies = await asyncio.gather(
-            keeper.save(), mesh.ask(mesh.keys.bookings_any, question, BookingsKept, timeout=TIMEOUT)
+            keeper.save(), mesh.ask(mesh.keys.bookings_any, question, BookingsKept, timeout=TIMEOUT_S)
         )
         answers, me, why = self._take(replies, question, asked), mesh.me.host, ""
         if sent and not any(
             other.candidate and other.host != me and _keeps(other, question, sent) for other in answers
         ):
-            living = await mesh.living(mesh.keys.alive_any(Role.CANDIDATE), timeout=LOOK)
+            living = await mesh.living(mesh.keys.alive_any(Role.CANDIDATE), timeout=FIND_CANDIDATES_S)
             if others := sorted({token.host for token in living} - {me}):
                 why = f"{', '.join(others[:3])} may lead as well, and did not store it"
             elif not saved:

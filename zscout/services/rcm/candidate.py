@@ -42,7 +42,7 @@ from zscout.services.placement.ledger import PlacementLedger
 from zscout.services.placement.load_balancer import LoadBalancer
 from zscout.services.rcm.booking_sharing import credible
 from zscout.services.rcm.digest import HoldListener
-from zscout.services.rcm.election import WAITS, Election, Setbacks, views
+from zscout.services.rcm.election import LEADER_WAIT, Election, Setbacks, views
 from zscout.services.rcm.inventory import Inventory
 from zscout.services.rcm.learned import Learned
 from zscout.services.rcm.observed_runtimes import RuntimeObserver
@@ -273,7 +273,7 @@ class Candidate:
         if self.election.must_wait(others, own, now):
             log.info("%d of %d other hosts still see a leader: waiting", sum(others.values()), len(others))
             if sum(others.values()) * 2 > len(others):
-                self.mesh.suspicions.suspect(UNSEEN, patience=WAITS / SECOND)
+                self.mesh.suspicions.suspect(UNSEEN, patience=LEADER_WAIT / SECOND)
             return True
         return False
 

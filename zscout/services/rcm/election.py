@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 from zscout.types import SECOND, HostName, Ns, Term
 
-SETTLE = SECOND // 4
+JOIN_TIME = SECOND // 4
 """The time after joining the mesh (0.2 s if no peer answers) by which an existing leader is seen. Before a candidate
 leads it asks the RCs, which know of a leader that it has not seen yet."""
 TURN = SECOND // 4
@@ -22,16 +22,16 @@ RETRY = SECOND // 10
 does not try at the same moment."""
 CALM = 10 * SECOND
 """A candidate not deposed for this long waits as after its first deposition."""
-ALONE = 2
+ALONE_SILENCES = 2
 """Silences that a deposed candidate waits at most while no other host answers: its own RCs wait as well."""
 MAX_DOUBLINGS = 5
-WAITS: Ns = 4 * SECOND
+LEADER_WAIT: Ns = 4 * SECOND
 """The time that a candidate waits for a leader seen only by others, before it reopens its session. It sees a living
 leader within a silence after that. RCs see a dead leader for a shorter time."""
-BACKOFF, MAX_BACKOFF = 1.0, 30.0
+BACKOFF_S, MAX_BACKOFF_S = 1.0, 30.0
 """Seconds until a failed candidate becomes one again: the first pause, doubled each time, and the longest."""
 BACKOFF_RESET_AFTER: Ns = 60 * SECOND
-"""After a candidacy of at least this length the next pause is BACKOFF again."""
+"""After a candidacy of at least this length the next pause is BACKOFF_S again."""
 
 
 class Setbacks:
@@ -47,7 +47,7 @@ class Setbacks:
     def delay(self, now: Ns) -> float:
         """A candidacy failed: the seconds until the next one."""
         self._failures = 1 if now - self._began > BACKOFF_RESET_AFTER else self._failures + 1
-        return min(BACKOFF * 2.0 ** (self._failures - 1), MAX_BACKOFF)
+        return min(BACKOFF_S * 2.0 ** (self._failures - 1), MAX_BACKOFF_S)
 
 
 def views(sights: Iterable[tuple[HostName, bool]], me: HostName) -> tuple[dict[HostName, bool], bool]:
@@ -80,7 +80,7 @@ class Election:
         self._candidates = Counter[str]()
         self._leaders: dict[str, Ns] = {}
         """By instance: the time at which a leader with a token last published (or its token appeared)."""
-        self._since = now + SETTLE
+        self._since = now + JOIN_TIME
         self._not_before: Ns = 0
         self._heard: Ns | None = None
         """The time of the last token or publication of a credible leader."""
@@ -116,7 +116,7 @@ class Election:
             self._leaders[instance] = self._heard = now
             self._alone_since = None
         elif self._leaders.pop(instance, None) is not None and not self._leaders:
-            # A candidate that has seen a leader has joined the mesh, and need not wait for SETTLE.
+            # A candidate that has seen a leader has joined the mesh, and need not wait for JOIN_TIME.
             self._since = now
 
     def published(self, term: Term, now: Ns) -> None:
@@ -165,7 +165,7 @@ class Election:
         lone = self._lone
         if lone is None or lone.host != host or (self._heard is not None and self._heard > lone.since):
             lone = self._lone = _Lone(host, now)
-        return now - lone.since >= WAITS + self.silence
+        return now - lone.since >= LEADER_WAIT + self.silence
 
     def must_wait(self, others: Mapping[HostName, bool], own: bool, now: Ns) -> bool:
         """Return True if RCs show a leader: most other hosts do (`views`), or this host (`own`).
@@ -181,9 +181,9 @@ class Election:
         if (
             self._led
             and self._deposed is not None
-            and now < min(self._yields_until, self._deposed + ALONE * self.silence)
+            and now < min(self._yields_until, self._deposed + ALONE_SILENCES * self.silence)
         ):
-            # The RCM that deposed this candidate may lead on unseen hosts: don't alternate with it.
+            # The RCM that deposed this candidate may still lead hosts that are unseen here: don't alternate with it.
             return True
         if not own and not self._was_away(now) and self._alone_since is None:
             return False

@@ -28,11 +28,11 @@ from zscout.types import SECOND, Ns
 log = logging.getLogger(__name__)
 
 FILE: Final = "devices.json"
-ASK_TIMEOUT: Final = 2.0
+ASK_TIMEOUT_S: Final = 2.0
 TRIES: Final = 3
-SAVE_AFTER: Final = 5.0
+SAVE_DELAY_S: Final = 5.0
 """Seconds for which changes are gathered before they are written."""
-SAVE_EVERY: Final = 300.0
+SAVE_PERIOD_S: Final = 300.0
 """Seconds between writes without changes: the file's date is when present devices were last seen."""
 
 
@@ -93,11 +93,11 @@ class Inventory:
     async def _catch_up(self) -> None:
         for _ in range(TRIES):
             key, ask = self.mesh.keys.rcm_state, StateAsk(devices_only=True)
-            reply = await self.mesh.ask_one(key, ask, RcmState, timeout=ASK_TIMEOUT)
+            reply = await self.mesh.ask_one(key, ask, RcmState, timeout=ASK_TIMEOUT_S)
             if reply is not None and reply.message is not None:
                 self.devices.remember(homes_in(reply.message.rcs), self.mesh.now())
                 return
-            await asyncio.sleep(ASK_TIMEOUT)
+            await asyncio.sleep(ASK_TIMEOUT_S)
         log.info("the leader did not list its devices in %d tries", TRIES)
 
     # On disk
@@ -118,11 +118,11 @@ class Inventory:
     async def _keep_saving(self, file: Path) -> None:
         saved: tuple[int, Ns] | None = None
         while True:
-            await asyncio.sleep(SAVE_AFTER)
+            await asyncio.sleep(SAVE_DELAY_S)
             now = self.mesh.now()
             self.devices.forget_old(now)
             version = self.devices.version
-            if saved is None or saved[0] != version or now - saved[1] > SAVE_EVERY * SECOND:
+            if saved is None or saved[0] != version or now - saved[1] > SAVE_PERIOD_S * SECOND:
                 saved = version, now
                 try:
                     await asyncio.to_thread(write_durably, file, self._contents(now))

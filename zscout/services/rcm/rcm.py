@@ -44,7 +44,7 @@ from zscout.types import SECOND, HostName, RcName, Term
 
 log = logging.getLogger(__name__)
 
-LATE_VOTE = 2.0
+LATE_VOTE_S = 2.0
 """Seconds within which a late vote still counts."""
 
 
@@ -370,7 +370,7 @@ class Rcm:
         over = steps.CoreEvents([VoteOverdue(proposal.proposal)])
         overdue = self.supervisor.call_later(vote_timeout, self._take_now, over)
         voted = partial(self.supervisor.guard(self._on_ballot), rc, proposal.proposal, overdue)
-        late = max(LATE_VOTE, 2 * vote_timeout)
+        late = max(LATE_VOTE_S, 2 * vote_timeout)
         try:
             self.mesh.ask_then(self.mesh.keys.vote(rc), proposal, messages.Ballot, voted, timeout=late)
         except MeshError as error:

@@ -18,7 +18,7 @@ from zscout.types import NO_TERM, Term
 log = logging.getLogger(__name__)
 
 FILE: Final = "term.json"
-KEPT_WITHIN: Final = 1.0
+WRITE_TIMEOUT_S: Final = 1.0
 """Seconds for which a candidate waits for its disk before it leads."""
 MAX_BYTES: Final = 4_096
 
@@ -77,7 +77,7 @@ class KeptTerm:
         async with self._lock:
             while (term := max(self._terms.highest, tried)) > self._saved:
                 try:
-                    async with asyncio.timeout(KEPT_WITHIN):
+                    async with asyncio.timeout(WRITE_TIMEOUT_S):
                         await self._disk.write(term)
                 except (OSError, TimeoutError) as error:
                     log.warning("term %d can't be kept on disk: %s", term.counter, error)
