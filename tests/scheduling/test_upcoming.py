@@ -99,7 +99,9 @@ class Story:
             need: {"rate": Fraction(choose.randrange(1, 4))} if need == "radio/rf" else {} for need in chosen or RCS[:1]
         }
         priority, runtime = choose.randrange(3), choose.randrange(1, 40)
-        return ArcRequest(name, f"h{choose.randrange(3)}/c", needs, priority, runtime, keep=choose.random() < 0.7)
+        until_done = choose.randrange(100) if choose.random() < 0.3 else 0
+        client, keep = f"h{choose.randrange(3)}/c", choose.random() < 0.7
+        return ArcRequest(name, client, needs, priority, runtime, keep, until_done=until_done)
 
     def tell(self) -> None:
         for arc in self.core.contended_holds():

@@ -48,6 +48,7 @@ MAX_CANDIDATES: Final = 1_000
 MAX_ENDPOINTS: Final = 256
 MAX_SITES: Final = 64
 MIN_RUNTIME: Final[Ns] = 60 * SECOND
+COMMAND_MIN_RUNTIME: Final[Ns] = 3600 * SECOND
 """Default, in ns."""
 DAY: Final[Ns] = 86_400 * SECOND
 MAX_HOSTS: Final = 1_000
@@ -189,6 +190,8 @@ class Fleet(Struct, frozen=True):
     placement: PlacementPolicy = DEFAULT_PLACEMENT
     min_runtime: Ns = MIN_RUNTIME
     """Minimum runtime of requests that give none."""
+    command_min_runtime: Ns = COMMAND_MIN_RUNTIME
+    """How long a hold is protected for a command whose request gives no minimum runtime."""
     devices: Mapping[str, tuple[str, ...]] = {}
     """The expected RCs by host."""
     security: Path | None = None
@@ -246,6 +249,15 @@ class FleetTable(Struct, frozen=True, forbid_unknown_fields=True):
     min_runtime: Annotated[Ns, seconds("0.001", "31622400", "Minimum runtime of requests that give none.")] = (
         MIN_RUNTIME
     )
+    command_min_runtime: Annotated[
+        Ns,
+        seconds(
+            "0",
+            "31622400",
+            "Protect the hold of a command without --min-runtime this long, cut to the next booking, maintenance or "
+            "reservation of its devices; no less than `min_runtime`.",
+        ),
+    ] = COMMAND_MIN_RUNTIME
 
 
 class FairSharesTable(Struct, frozen=True, forbid_unknown_fields=True):
@@ -357,6 +369,7 @@ def _fleet(file: FleetFile, top: Where, folder: Path = Path()) -> Fleet:
         security=None if file.security is None else keys_folder(file.security, folder, top),
         access=access,
         min_runtime=min(table.min_runtime, policy.max_runtime or table.min_runtime),
+        command_min_runtime=min(table.command_min_runtime, policy.max_runtime or table.command_min_runtime),
     )
     check_security(fleet, top)
     return fleet

@@ -114,6 +114,9 @@ class _Request(_Asked, frozen=True):
     """The id under which the client had `place`, if it differs from `id`. A request open under it ends."""
     booking: BookingRef = ""
     """The booking that the ARC takes up, with the same needs: its id, or `booking` of a notice."""
+    until_done: bool = False
+    """It runs a command: a kept hold is protected for the fleet's `command_min_runtime`, cut to the next reserved time
+    of its devices. Without effect where `min_runtime` is less than the fleet's."""
 
 
 class OpenRequest(_Request, frozen=True):
@@ -289,6 +292,8 @@ class _Hold(_ArcParty, frozen=True, kw_only=True):
     waits: Elapsed | None = None
     """Seconds, at most, until all devices have begun, after which `remaining` counts; from an RC, until this device
     has. None if begun."""
+    runtime: Elapsed | None = None
+    """Seconds for which this hold is protected in all, if longer than `min_runtime`."""
 
 
 class Holder(_Hold, frozen=True):

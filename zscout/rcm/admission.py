@@ -115,18 +115,21 @@ class Admission:
             check_name(asked.arc, "arc")
             if more is not None and more.continues:
                 check_name(more.continues, "continues")
+            min_runtime = duration(asked.min_runtime, "min_runtime")
+            until_done = more is not None and more.until_done
             return ArcRequest(
                 arc=arc_id(client, asked.id),
                 client=client,
                 needs={name: exact_amounts(params) if params else {} for name, params in asked.needs.items()},
                 priority=asked.priority,
-                min_runtime=duration(asked.min_runtime, "min_runtime"),
+                min_runtime=min_runtime,
                 keep=asked.keep,
                 label=asked.arc,
                 direct=more is not None and more.direct,
                 continues="" if more is None else more.continues,
                 who=None if more is None else self.authority.certified_who(sender, more.who),
                 charged_to=self.authority.starter(client),
+                until_done=self.authority.until_done(sender.host, min_runtime) if until_done else 0,
             )
         except (BadName, ValueError) as error:
             raise Refused("bad_request", str(error)) from None
@@ -246,8 +249,7 @@ class Admission:
         most, longest = self.authority.highest_priority(host), self.authority.longest_runtime(host)
         most = MAX_PRIORITY if most is None else most
         priority = max(-MAX_PRIORITY, min(request.priority, most))
-        if longest and request.min_runtime > longest:
-            request = replace(request, min_runtime=longest)
+        request = request.at_most(longest) if longest else request
         return request if priority == request.priority else replace(request, priority=priority)
 
 

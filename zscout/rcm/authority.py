@@ -37,6 +37,7 @@ class Authority:
     def __init__(self, fleet: Fleet) -> None:
         self._policy, self.enforced = fleet.access, fleet.security is not None
         self.limits = fleet.limits
+        self._runtimes = fleet.min_runtime, fleet.command_min_runtime
         self._operator_priority = fleet.operator_priority
         self.placed: Mapping[ComponentId, Placement] = {}
         """The components that the placer published last."""
@@ -44,6 +45,7 @@ class Authority:
     def reload(self, fleet: Fleet) -> None:
         """Take the rights and limits of a fleet file that was read again."""
         self._policy, self.limits = fleet.access, fleet.limits
+        self._runtimes = fleet.min_runtime, fleet.command_min_runtime
 
     def bound(self, policy: SchedulingPolicy) -> SchedulingPolicy:
         """Return the policy with the rights and limits that the scheduler enforces. A name in several groups belongs
@@ -108,6 +110,13 @@ class Authority:
     def longest_runtime(self, name: str) -> Ns:
         """The longest minimum runtime that this name may request; 0: any."""
         return (self._policy.ceiling(name).runtime or 0) if self.enforced else 0
+
+    def until_done(self, name: str, min_runtime: Ns) -> Ns:
+        """How long a hold of this name for a command is protected; 0: no longer than `min_runtime`. A request that
+        gives less than the fleet's minimum runtime, and so ranks before others, has no more than that."""
+        usual, most = self._runtimes
+        longest = self.longest(name) or most
+        return min(most, longest) if min_runtime >= usual else 0
 
     def starter(self, client: ClientId) -> str:
         """The name whose quotas count a component's requests: it acts for whoever started it, on the host that the

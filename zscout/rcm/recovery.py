@@ -34,6 +34,7 @@ from zscout.messages import (
     exact_amounts,
 )
 from zscout.rcm.admission import Admission, Admitted, binding
+from zscout.rcm.authority import Authority
 from zscout.rcm.places import arc_id, request_id
 from zscout.scheduling.model import Adopted, ArcRequest, ArcStatus, RecoveredHold, Released, Requested, Vouched
 from zscout.types import NO_TERM, SECOND, ArcId, ClientId, Grant, HostName, Need, Ns, Params, Place, RcName
@@ -331,12 +332,14 @@ def _hold(
     bound: Mapping[Need, RcName] = some.bound
     place: Place | None = some.place
     if not admission.closed:
-        request = _reported_request(arc, some, _needs(held, some, own, _patterns(some)), direct=direct)
+        needs = _needs(held, some, own, _patterns(some))
+        request = _reported_request(arc, some, needs, admission.authority, direct=direct)
     elif own is None:
         for rc in some.rcs:
             check_rc(rc)
         some = replace(some, continues="", booking="", who=None)
-        request, bound, place = _reported_request(arc, some, _needs(held, some, None, {}), direct=direct), {}, None
+        needs, bound, place = _needs(held, some, None, {}), {}, None
+        request = _reported_request(arc, some, needs, admission.authority, direct=direct)
     else:
         found = binding(own.request.needs, some.rcs, bound)
         if found is None or not _agree(own.request.needs, found, held):
@@ -345,8 +348,16 @@ def _hold(
         place = some.place if own.expects else own.place
     request = admission.clamped(request)
     vouched = not admission.closed or own is not None
-    start, protected = min(now, end - request.min_runtime), _protected_from(held, now)
-    return RecoveredHold(request, place, some.grant, start, end, bound, vouched, protected, waits)
+    runtime = _runtime(held, request)
+    start, protected = min(now, end - (runtime or request.min_runtime)), _protected_from(held, now)
+    return RecoveredHold(request, place, some.grant, start, end, bound, vouched, protected, waits, runtime)
+
+
+def _runtime(held: Mapping[RcName, Holder], request: ArcRequest) -> Ns | None:
+    """The minimum runtime of a hold, if it is longer than its request's."""
+    reported = max((holder.runtime for holder in held.values() if holder.runtime is not None), default=0.0)
+    runtime = min(round(reported * SECOND), request.until_done)
+    return runtime if runtime > request.min_runtime else None
 
 
 def _waits(held: Mapping[RcName, Holder], states: Mapping[RcName, RcState], now: Ns) -> dict[RcName, Ns | None]:
@@ -406,9 +417,12 @@ def _patterns(holder: Holder) -> dict[RcName, Need]:
     return patterns
 
 
-def _reported_request(arc: ArcId, holder: Holder, needs: Mapping[Need, Params], *, direct: bool) -> ArcRequest:
+def _reported_request(
+    arc: ArcId, holder: Holder, needs: Mapping[Need, Params], authority: Authority, *, direct: bool
+) -> ArcRequest:
     """The request as an RC reports it. Raises BadName, ValueError."""
-    client_of(holder.client)
+    host = client_of(holder.client).host
+    min_runtime = duration(Decimal(holder.min_runtime), "min_runtime")
     check_name(holder.id, "id")
     check_name(holder.arc, "arc")
     for need in needs:
@@ -418,13 +432,14 @@ def _reported_request(arc: ArcId, holder: Holder, needs: Mapping[Need, Params], 
         client=holder.client,
         needs=needs,
         priority=holder.priority,
-        min_runtime=duration(Decimal(holder.min_runtime), "min_runtime"),
+        min_runtime=min_runtime,
         keep=holder.keep,
         label=holder.arc,
         direct=direct,
         continues=holder.continues,
         booking=holder.booking,
         who=holder.who,
+        until_done=0 if holder.runtime is None else authority.until_done(host, min_runtime),
     )
 
 

@@ -143,6 +143,7 @@ def _held(arc: ArcStatus, hold: Hold, now: Ns) -> dict[str, Any]:
         "direct": arc.request.direct,
         "continues": arc.request.continues,
         "protected_from": _protected_from(hold, now),
+        "runtime": None if hold.runtime is None else hold.runtime / SECOND,
     }
 
 

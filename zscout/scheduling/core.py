@@ -24,6 +24,7 @@ from zscout.scheduling.calendar import Calendar
 from zscout.scheduling.model import Arc, ArcState, ArcStatus, Hold, Outcome, Rc, RcStatus, Status
 from zscout.scheduling.priority import Priority, reason_of_now, reasons_of_now
 from zscout.scheduling.reason import Reason, ReasonCode, of_rcs
+from zscout.scheduling.reservations import Reservations
 from zscout.scheduling.runtimes import RuntimeEstimator
 from zscout.scheduling.slots import SlotsFound, slots
 from zscout.scheduling.state import SchedulerState, Strategy
@@ -215,6 +216,7 @@ class Core:
                 arc.bound,
                 arc.vouched,
                 arc.hold.protected_from,
+                runtime=arc.hold.runtime,
             )
             for arc in state.running.values()
             if arc.hold is not None
@@ -512,6 +514,7 @@ class Core:
             told.bound,
             protected_from=hold.protected_from,
             waits={**arc.waits},
+            runtime=hold.runtime,
         )
         self._state.stop(arc)
         self._forget(arc)
@@ -539,7 +542,7 @@ class Core:
         arc.vouched = held.vouched
         if arc.patterns:
             self._state.bind(arc, held.bound)
-        hold = self._state.hold(arc, held.grant, held.start, held.end, held.protected_from)
+        hold = self._state.hold(arc, held.grant, held.start, held.end, held.protected_from, held.runtime)
         arc.waits = {**held.waits}
         if (waits := max(filter(None, held.waits.values()), default=None)) is not None:
             hold = replace(hold, waits=waits, last=self._state.last(arc, waits, held.end))
@@ -587,12 +590,21 @@ class Core:
     def start(self, arc: Arc) -> None:
         grant = Grant(self.term, self.number())
         now, state = self._state.now, self._state
-        hold = state.hold(arc, grant, now, arc.ends(now) if self._foretells else arc.ends_after(now, now))
+        runtime, begun = self._protected_runtime(arc), now + arc.begin_within if self._foretells else now
+        hold = state.hold(arc, grant, now, arc.ends_after(now, begun, runtime), runtime=runtime)
         if not arc.preemptions:
             state.runtimes.count(arc.owner, arc.request.min_runtime)
         waited = 0 if arc.state is ArcState.NEW else now - arc.since
         self._state.start(arc, hold)
         self._effects.append(self._granted(arc, hold, waited))
+
+    def _protected_runtime(self, arc: Arc) -> Ns | None:
+        """The minimum runtime of a hold that starts now; None: its request's."""
+        request, begun = arc.request, self._state.now + arc.begin_within
+        if request.until_done <= request.min_runtime or not request.keep or arc.claim is not None:
+            return None
+        free = Reservations(self._state).free_until(arc, begun + request.until_done) - begun
+        return free if free > request.min_runtime else None
 
     def _begin(self, reported: model.RcBegins) -> None:
         """Count the runtimes of the holds of an RC from when the last RC of each has begun."""
@@ -612,7 +624,7 @@ class Core:
         if waits == hold.waits or (waits is not None and abs(waits - (hold.waits or 0)) < model.WAITS_SLACK):
             return
         begun = now if waits is None else max(now, waits)
-        end = arc.ends_after(hold.start, begun)
+        end = arc.ends_after(hold.start, begun, hold.runtime)
         last = self._state.last(arc, begun, end)
         self._state.retime(arc, replace(hold, end=end, last=last, waits=waits))
         rcs = tuple(sorted(arc.needs))

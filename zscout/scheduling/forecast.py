@@ -101,7 +101,8 @@ def forecast(
                         ends[arc] = running.hold.end
                         expect(running.request, running.hold)
                         if newcomer is not None and arc == newcomer.arc:
-                            result.begin_within = max(0, ends[arc] - start - running.request.min_runtime)
+                            runtime = running.hold.runtime or running.request.min_runtime
+                            result.begin_within = max(0, ends[arc] - start - runtime)
                 case HoldEnded(arc=arc, outcome=outcome, by=by, requeued=requeued):
                     ends.pop(arc, None)
                     releases.pop(arc, None)

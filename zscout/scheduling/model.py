@@ -14,7 +14,7 @@ from enum import StrEnum
 from operator import itemgetter
 from typing import Final, NamedTuple, TypeAlias
 
-from msgspec import Struct
+from msgspec import Struct, structs
 
 from zscout.keyexpr import is_pattern, matcher
 from zscout.messages import Who
@@ -72,6 +72,16 @@ class ArcRequest(Struct, frozen=True):
     """The requester, for people; unused by the core."""
     charged_to: str = ""
     """The name whose quotas count, if not its client's host: that of a component's starter."""
+    until_done: Ns = 0
+    """A kept hold is protected this long, if that is more than `min_runtime`, but not beyond the next reserved time of
+    its RCs (`Core.start`). Rank, patience and reservations go by `min_runtime`."""
+
+    def at_most(self, longest: Ns) -> ArcRequest:
+        """The request with runtimes of at most `longest` ns."""
+        if max(self.min_runtime, self.until_done) <= longest:
+            return self
+        shorter = min(self.min_runtime, longest), min(self.until_done, longest)
+        return structs.replace(self, min_runtime=shorter[0], until_done=shorter[1])
 
     @property
     def owner(self) -> str:
@@ -101,6 +111,8 @@ class Hold(Struct, frozen=True):
     protected_from: Ns = 0
     waits: Ns | None = None
     """While devices of it have not begun: when the last one begins at the latest. Its runtime counts from then."""
+    runtime: Ns | None = None
+    """The minimum runtime of this hold, if it is longer than its request's (`until_done`)."""
 
     def remaining(self, now: Ns) -> Ns:
         """What is left of the minimum runtime; all of it while devices have not begun."""
@@ -220,9 +232,10 @@ class Arc:
         """The latest end of its minimum runtime, or of its booking, if it is granted then."""
         return self.ends_after(start, start + self.begin_within)
 
-    def ends_after(self, start: Ns, begun: Ns) -> Ns:
-        """The end of its minimum runtime, or of its booking, if it is granted at `start` and its devices begin then."""
-        end = begun + self.request.min_runtime
+    def ends_after(self, start: Ns, begun: Ns, runtime: Ns | None = None) -> Ns:
+        """The end of its minimum runtime, or of its booking, if it is granted at `start` and its devices begin then.
+        `runtime`: that of the hold, if not the request's."""
+        end = begun + (self.request.min_runtime if runtime is None else runtime)
         return end if self.claim is None or start >= self.claim.booking.end else self.claim.booking.end
 
     @property
@@ -485,6 +498,8 @@ class RecoveredHold(Struct, frozen=True):
     """As its RCs report it; None: they do not."""
     waits: Mapping[RcName, Ns | None] = {}
     """The RCs that have not begun (`Arc.waits`): `end` counts from the last one's bound."""
+    runtime: Ns | None = None
+    """As `Hold.runtime`."""
 
     def __post_init__(self) -> None:
         patterns = {need for need in self.request.needs if is_pattern(need)}

@@ -220,6 +220,17 @@ class Reservations:
     def due(self, arc: Arc) -> Ns:
         return arc.since + arc.late + arc.patience
 
+    def free_until(self, arc: Arc, end: Ns) -> Ns:
+        """The first reserved time of the RCs of `arc` from now on that is not its own, nor for starving ARCs of lower
+        priority; `end` if that is earlier."""
+        now, band = self._state.now, self._state.band
+        for rc in self._state.rcs_in(arc.mask & self.bits):
+            for promise in self.at(rc, now, end):
+                binds = promise.booked is not None or band(arc.priority) <= band(promise.arc.priority)
+                if binds and promise.arc is not arc:
+                    end = min(end, max(now, promise.start))
+        return end
+
     def goes_first(self, arc: Arc) -> bool:
         """Return True if `arc` precedes its equals. A sharable RC may accept each backfilled ARC alone but not all
         together, so a due ARC goes first there."""

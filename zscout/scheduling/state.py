@@ -113,8 +113,7 @@ class SchedulerState:
         """An ARC that neither waits nor runs yet. `max_runtime` of the policy (`max_booking` for a booked ARC) caps its
         minimum runtime, also in ranks and reservations."""
         longest = self.policy.max_booking if request.booking in self.claims else self.policy.max_runtime
-        if longest is not None and request.min_runtime > longest:
-            request = structs.replace(request, min_runtime=longest)
+        request = request if longest is None else request.at_most(longest)
         patterns = tuple(filter(is_pattern, request.needs))
         named = self.mask(need for need in request.needs if need not in patterns)
         arc = Arc(request, place, named, patterns, named, since=self.now, patience=self.patience)
@@ -512,9 +511,12 @@ class SchedulerState:
             return None
         return max(start + limit, end) if arc.request.booking else start + limit
 
-    def hold(self, arc: Arc, grant: Grant, start: Ns, end: Ns, protected_from: Ns | None = None) -> Hold:
-        """A hold granted to `arc` then. `protected_from`: as reported of one that goes on."""
-        policy, budget = self.policy, round(self.policy.preempt_budget * arc.request.min_runtime)
+    def hold(
+        self, arc: Arc, grant: Grant, start: Ns, end: Ns, protected_from: Ns | None = None, runtime: Ns | None = None
+    ) -> Hold:
+        """A hold granted to `arc` then. `protected_from`: as reported of one that continues."""
+        policy = self.policy
+        budget = round(policy.preempt_budget * (arc.request.min_runtime if runtime is None else runtime))
         below: int | None = policy.operator_priority
         waited = arc.waited if arc.state is ArcState.RUNNING else start - arc.since
         if policy.preempt != "always" or (policy.promise == "all" and arc.starving):
@@ -526,7 +528,7 @@ class SchedulerState:
         else:
             is_due = 0 < arc.patience <= waited - arc.told
             protected_from = start if is_due else start + max(0, budget - arc.lost)
-        return Hold(grant, start, end, below, self.last(arc, start, end), protected_from)
+        return Hold(grant, start, end, below, self.last(arc, start, end), protected_from, runtime=runtime)
 
     def quota_left(self, arc: Arc) -> int | None:
         quota = self.policy.max_running_per_host

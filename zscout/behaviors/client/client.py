@@ -145,6 +145,7 @@ class Client:
         wait_for_device: bool | None = None,
         booking: str = "",
         continues: str = "",
+        until_done: bool = False,
     ) -> OpenArc:
         """Request devices, and return when the leader has answered, however long that takes.
 
@@ -165,6 +166,8 @@ class Client:
           and waits for its next date.
         - `continues`: the name of this client's request whose hold this one replaces. It must hold less, at a lower
           priority. If all its devices pass over in one step, they are not made safe in between.
+        - `until_done`: without `min_runtime`, protect the hold for the fleet's `command_min_runtime` (an hour) or, if
+          sooner, until the next booking, maintenance or reservation of its devices.
 
         If another client is handing over a request of this name and these needs, that request is returned.
 
@@ -176,6 +179,7 @@ class Client:
             seconds, now = self._protected(min_runtime), self.mesh.now()
             arc = OpenArc(new_instance(), name, wanted, priority, seconds, keep, estimate, direct, since=now)
             arc.who, arc.booking, arc.continues = who, booking, continues
+            arc.until_done = until_done and min_runtime is None and keep
             arc._check, arc._wait_for_device = True, self._waits(wait_for_device)
             self._store.add(arc)
         elif estimate:

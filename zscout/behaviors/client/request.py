@@ -87,6 +87,8 @@ class OpenArc:
     """User, host and command of the request, shown to other people."""
     booking: str = ""
     """The booking that it takes up: its id; once the leader has answered, with its date: `<id>@<start>`."""
+    until_done: bool = False
+    """Whether it runs a command, which the fleet's `command_min_runtime` protects."""
     _check: bool = False
     """True to be refused at once if it can never start."""
     _wait_for_device: bool = False
@@ -156,6 +158,7 @@ class OpenArc:
         id_, name = check_name(request.id, "id"), check_name(request.arc, "arc")
         arc = cls(id_, name, request.needs, request.priority, request.min_runtime, request.keep, _place=request.place)
         arc.direct, arc.continues, arc.booking = request.direct, request.continues, request.booking
+        arc.until_done = request.until_done
         arc.who = request.who and msgspec.structs.replace(request.who, host="")
         arc.state, arc.reason = "expected", "waiting for another client to hand it over"
         arc.since, arc._waits_since = now, now - round(request.waited * SECOND)
@@ -348,6 +351,7 @@ class OpenArc:
             continues=self.continues,
             who=self.who,
             booking=self.booking,
+            until_done=self.until_done,
         )
 
 

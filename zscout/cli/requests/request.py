@@ -176,6 +176,7 @@ async def wait_for_grant(client: Client, wanted: HoldOptions, report: Report, ar
                     estimate=True,
                     direct=wanted.direct or bool(wanted.command),
                     booking=wanted.booking,
+                    until_done=bool(wanted.command),
                 )
             async with common.beside(_give_up_once_queued(client, arc, limit)) if once else nullcontext():
                 grant = await client.granted(arc, confirmed=True)

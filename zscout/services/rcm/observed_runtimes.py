@@ -58,7 +58,8 @@ class RuntimeObserver:
         wish = _wish(holder.arc, holder.who, needs, asked)
         # A hold that is seen late, or that continues under a new grant, began earlier: by the part of its minimum
         # runtime that is used up.
-        self._open[holder.grant] = _Begun(wish, now - max(0, asked - round(holder.remaining * SECOND)))
+        runtime = asked if holder.runtime is None else round(holder.runtime * SECOND)
+        self._open[holder.grant] = _Begun(wish, now - max(0, runtime - round(holder.remaining * SECOND)))
         if len(self._open) > MAX_OPEN:
             self._open.popitem(last=False)
 
