@@ -40,6 +40,7 @@ from zscout.cli.requests.waiting import NeedContention, contention_of, hold_text
 from zscout.config.strict import BadInput
 from zscout.mesh.supervision import done_within
 from zscout.messages import Foresight, RcmState, RcState, StateAsk, version_words
+from zscout.rcm.authority import Authority
 from zscout.scheduling.reason import ReasonCode, kept, starting, waits
 from zscout.terminal import LiveLine, clean, clock, print_json, print_line, span
 from zscout.types import SECOND, VERSION, Ns
@@ -217,7 +218,8 @@ async def _use(client: Client, wanted: HoldOptions, report: Report, arc: OpenArc
     rcs, left, longest = held_text(held), held.remaining, client.fleet.scheduling.max_runtime
     details = {"id": arc.id, "rcs": held.rcs, "bound": held.bound, "keep": arc.keep}
     details |= {"grant": grant, "remaining": round(left, 3)}
-    report.event("granted", f"{arc.name} holds {rcs}: {_yours(arc, left, longest)}", **details)
+    yours = _yours(arc, left, longest, cut=_is_cut(client, arc, left))
+    report.event("granted", f"{arc.name} holds {rcs}: {yours}", **details)
     try:
         code = None
         if wanted.tolerate is not None:
@@ -405,11 +407,18 @@ async def _after_loss(client: Client, wanted: HoldOptions, report: Report, arc: 
     raise Failed(f"{line}; ask again{', or with a higher priority' if ending.outcome == 'preempted' else ''}")
 
 
-def _yours(arc: OpenArc, left: float, longest: Ns | None) -> str:
-    """Words for the rest of a hold. left: protected seconds. longest: the fleet's maximum runtime."""
-    continues = arc.keep and (longest is None or arc.min_runtime * SECOND < longest)
+def _is_cut(client: Client, arc: OpenArc, left: float) -> bool:
+    """Return True if a hold for a command is protected for less time than usual: its devices are needed then."""
+    usual = Authority(client.fleet).until_done(client.mesh.me.host, round(arc.min_runtime * SECOND))
+    return arc.until_done and left + 1 < usual / SECOND
+
+
+def _yours(arc: OpenArc, left: float, longest: Ns | None, *, cut: bool = False) -> str:
+    """How long a hold lasts that is protected for `left` seconds; `longest` as the fleet allows."""
+    continues = arc.keep and (longest is None or max(arc.min_runtime, round(left)) * SECOND < longest)
     then = _kept(longest, arc.priority) if continues else "given back"
-    return f"yours for {span(left)} (until {clock(left)}), then {then}"
+    cause = ", when it is booked or reserved" if cut else ""
+    return f"yours for {span(left)} (until {clock(left)}{cause}), then {then}"
 
 
 def _kept(longest: Ns | None, priority: int) -> str:
