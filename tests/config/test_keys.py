@@ -51,6 +51,7 @@ FLEET: Final[Mapping[str, Mapping[str, Key]]] = {
         "candidates": Key("[]", ('["anvil"]',), ('["a/b"]', '["a", "a"]', '"anvil"', "[1]")),
         "strategy": Key('"adaptive"', ('"priority"', '"optimal"'), ('"best"', "1")),
         "operator_priority": _number("10", "0", "1_000_000_000", "-1", "1_000_000_001"),
+        "command_min_runtime": _number("3600.0", "0", "31_622_400", "-1", "31_622_401"),
         "min_runtime": _number("60.0", "0.001", "31_622_400", "0", "31_622_401"),
         "preempt": Key('"always"', ('"after_min_runtime"',), ('"never"', "true")),
         "preempt_budget": _number("0.25", "0", "1_000_000", "-0.1", "1_000_001"),

@@ -248,3 +248,19 @@ def test_what_a_name_may_order_a_node_to_do(tmp_path: Path, sender: Sender, may:
     assert {
         name for name, order in COMPONENT.items() if not refusal(partial(told.check_component, sender, order))
     } == may
+
+
+@pytest.mark.parametrize(
+    ("text", "min_runtime", "until_done"),
+    [
+        ("", 60, 3600),
+        ("", 59, 0),  # it would rank before others and still hold for an hour
+        ('[fleet]\nmin_runtime = 20\ncommand_min_runtime = "2h"', 20, 7200),
+        ("[limits]\nmax_runtime = 600", 60, 600),
+        (FILE, 60, 60),
+    ],
+)
+def test_a_command_is_protected_as_the_fleet_and_its_role_allow(
+    tmp_path: Path, text: str, min_runtime: int, until_done: int
+) -> None:
+    assert authority(tmp_path, text).until_done("bob", min_runtime * SECOND) == until_done * SECOND

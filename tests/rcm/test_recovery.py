@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from decimal import Decimal
 from fractions import Fraction
 from pathlib import Path
@@ -125,6 +126,22 @@ def test_a_standing_hold_is_carried_on_as_it_is() -> None:
     assert (request.arc, request.client, request.name) == ("h/one/gang-id", "h/one", "gang")
     assert (request.priority, request.keep, request.min_runtime) == (3, True, 60 * SECOND)
     assert request.needs == {"robot/a": {}, "radio/b": {"rate": Fraction(5, 2)}}
+
+
+@pytest.mark.parametrize("clients", [[], [client(structs.replace(RUNS.requests[0], until_done=True))]])
+@pytest.mark.parametrize("admission", [plain, secured])
+@pytest.mark.parametrize(("reported", "runtime"), [(600, 600), (1e9, 3600), (30, None)])
+def test_a_command_keeps_its_longer_runtime_within_what_the_fleet_gives(
+    clients: list[ClientRequests], admission: Callable[[], Admission], reported: float, runtime: float | None
+) -> None:
+    states = [structs.replace(state, holders=[_command(one, reported) for one in state.holders]) for state in BOTH]
+    (held,) = recover(states, clients, NOW, admission()).holds
+    assert held.runtime == (None if runtime is None else runtime * SECOND)
+    assert held.start == min(NOW, NOW + 500 * SECOND - (held.runtime or 60 * SECOND))
+
+
+def _command(holder: Holder, runtime: float) -> Holder:
+    return structs.replace(holder, keep=True, runtime=runtime, remaining=500.0)
 
 
 def test_clocks_differ_a_little_and_the_earliest_end_counts() -> None:

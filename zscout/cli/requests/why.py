@@ -155,7 +155,7 @@ def _print_request(arc: dict[str, Any], me: User) -> None:
     who = f"{request_words(arc['arc'], arc['who'], arc['client'])}, priority {arc['priority']},"
     command = f", command {arc['who'].command}" if arc["who"] is not None and arc["who"].command else ""
     names = f"  id {arc['id']}, client {arc['client']}{command}{comment(arc['who'])}"
-    runtime = terminal.span(float(arc["min_runtime"]))
+    runtime = terminal.span(float(arc.get("runtime") or arc["min_runtime"]))
     if arc["state"] == "running":
         _echo(f"{who} has run since {_past(arc['held'])}", bold=True, fg="green")
         _echo(names)
