@@ -94,6 +94,8 @@ class Work:
     counts: Counter[str]
     log: Callable[[str], None]
     broken: Callable[[str], None]
+    commands: bool = False
+    """Many requests are for commands: they give no minimum runtime, and are protected for longer."""
     touched: Mapping[str, Device] | None = None
     """By RC: its device, if programs use devices past their RCs."""
     over: bool = False
@@ -113,6 +115,8 @@ class Work:
                 "min_runtime": round(rng.uniform(0.3, 3) * times, 3),
                 "keep": rng.random() < 0.1,
             }
+            if self.commands and rng.random() < 0.6:
+                how |= {"min_runtime": None, "keep": True, "until_done": True}
             if self.touched is not None:
                 how["direct"] = rng.random() < 0.6
             self.counts["requests"] += 1

@@ -131,13 +131,15 @@ class Size:
     """Two devices need time to start for a holder."""
     unwell: bool = False
     """Devices fail temporarily now and then."""
+    commands: bool = False
+    """Many programs run commands: they are protected for longer than they rank by."""
     forger: bool = False
     """The fleet has certificates, and a member lists, reports and keeps forgeries."""
 
     @classmethod
     def of(cls, seed: int) -> Size:
         """Every tenth run each is long with many clients, or has failing moves, or programs that use devices past their
-        RCs, or a thief, or liars. Every fifth run has bookings, every twentieth a forger, every fortieth slow devices,
+        RCs, or commands, or a thief, or liars. Every fifth run has bookings, every twentieth a forger, every fortieth slow devices,
         every eightieth unwell devices."""
         match seed % 10:
             case 3 | 4:
@@ -148,6 +150,8 @@ class Size:
                 return cls(hosts=4, clients=20, faults=30, span=300.0, pause=60.0)
             case 7:
                 return cls(moves_only=True)
+            case 2:
+                return cls(commands=True)
             case 0:
                 return cls(thief=True)
             case 6:
@@ -213,6 +217,8 @@ class Simulation:
         self.fleet = replace(fleet, strategy=self.random.choice(("priority", "adaptive")))
         if size.bookers:
             self.fleet = replace(self.fleet, strategy="adaptive")
+        if size.commands:
+            self.fleet = replace(self.fleet, min_runtime=SECOND // 2, command_min_runtime=20 * SECOND)
         if size.forger:
             self.fleet = forgers.closed(replace(self.fleet, strategy="adaptive"), self.hosts, self.candidates_at)
         self.where = {rc: f"{self.random.choice(self.hosts)}/{self._program(rc)}" for rc in DEVICES}
@@ -280,7 +286,8 @@ class Simulation:
         DEEDS.set(Deeds(self.broken, calm, lambda: self.work.over, self.busy))
         self.component = type("Component", (SimulatedComponent,), {"processes": self})
         touched = self.devices if self.size.direct else None
-        self.work = Work(DEVICES, self.size.pause, self.result.counts, self.log, self.broken, touched)
+        counts = self.result.counts
+        self.work = Work(DEVICES, self.size.pause, counts, self.log, self.broken, self.size.commands, touched)
         self.promises = Promises(
             self.broken,
             lambda: loop.now,

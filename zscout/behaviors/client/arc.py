@@ -323,7 +323,10 @@ class Attempt:
         raise revoked from None
 
 
-_ASKED = ("name", "needs", "priority", "min_runtime", "keep", "direct", "comment", "wait_for_device", "booking")
+_ASKED = (
+    *("name", "needs", "priority", "min_runtime", "keep"),
+    *("direct", "comment", "wait_for_device", "booking", "until_done"),
+)
 
 
 def _ask(*values: Any) -> dict[str, Any]:
@@ -345,6 +348,7 @@ def hold(
     comment: str = "",
     wait_for_device: bool | None = None,
     booking: str = "",
+    until_done: bool = False,
 ) -> Attempt:
     """Hold devices for the body of an `async with`, whose target is a `Held`.
 
@@ -360,7 +364,7 @@ def hold(
     - `timeout`: seconds to wait for the grant. Entering raises TimeoutError after that, and the request is cancelled.
 
     Entering also raises RequestRefused and Revoked."""
-    ask = _ask(name, needs, priority, min_runtime, keep, direct, comment, wait_for_device, booking)
+    ask = _ask(name, needs, priority, min_runtime, keep, direct, comment, wait_for_device, booking, until_done)
     return Attempt(client, ask, timeout=timeout, confirmed=confirmed)
 
 
@@ -377,13 +381,14 @@ async def holds(
     comment: str = "",
     wait_for_device: bool | None = None,
     booking: str = "",
+    until_done: bool = False,
     estimate: bool = False,
     continues: str = "",
 ) -> AsyncIterator[Attempt]:
     """Hold devices repeatedly: yield a `hold` to enter, and another whenever the hold was taken away. Ends after a body
     that ended by itself, and with `keep=False` after the minimum runtime. Takes the arguments of `hold` without
     `timeout`, and `estimate` and `continues` of `Client.request`."""
-    ask = _ask(name, needs, priority, min_runtime, keep, direct, comment, wait_for_device, booking)
+    ask = _ask(name, needs, priority, min_runtime, keep, direct, comment, wait_for_device, booking, until_done)
     ask |= {"estimate": estimate, "continues": continues}
     attempt = Attempt(client, ask, again=True, confirmed=confirmed)
     yield attempt

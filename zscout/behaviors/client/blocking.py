@@ -377,6 +377,7 @@ class Lab:
         comment: str = "",
         wait_for_device: bool | None = None,
         booking: str = "",
+        until_done: bool = False,
     ) -> AbstractContextManager[BlockingHeld, None]:
         """Hold devices for the body of a `with`, whose target is a `BlockingHeld`.
 
@@ -395,12 +396,13 @@ class Lab:
         - `wait_for_device`: wait for an unknown device instead of raising RequestRefused.
         - `booking`: the id of a booking to take up. The request has its needs and priority, and waits for its next
           date.
+        - `until_done`: without `min_runtime`, protect the hold as that of a command (`Client.request`).
 
         Entering raises TimeoutError; RequestRefused; Revoked if the request was ended elsewhere; NoRcm if no leader is
         visible within 3 s. Leaving raises Revoked if the hold was taken away and the body was not interrupted."""
         how: dict[str, Any] = {"priority": priority, "min_runtime": min_runtime, "keep": keep, "timeout": timeout}
         how |= {"comment": comment, "direct": direct, "confirmed": confirmed, "wait_for_device": wait_for_device}
-        how["booking"] = booking
+        how |= {"booking": booking, "until_done": until_done}
         return BlockingAttempt(self, hold(self.client, name, needs, **how), interrupt=interrupt)
 
     def acquire(self, name: str, needs: Needs, **how: Any) -> BlockingHeld:

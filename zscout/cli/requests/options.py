@@ -303,8 +303,8 @@ def hold_options(command: F, *, needs_required: bool = True, runs_command: bool 
         click.option(
             "--min-runtime",
             type=Parsed("duration", parse_duration),
-            help="Protect the hold this long from requests of equal priority: 90s, 5m, 2h, 1d12h. Default: the fleet's, "
-            "60 s; with a command an hour, or until the next booking of a device.",
+            help="Protect the hold this long from requests of equal priority: 90s, 5m, 2h, 1d12h. Default: the "
+            "fleet's, 60 s; with a command an hour, or until the next booking of a device.",
         ),
     )
     for option in (
