@@ -141,8 +141,8 @@ def without(settings: dict[str, Any], path: str) -> dict[str, Any]:
 async def test_each_setting_keeps_somebody_out(
     lab: ClosedLab, monkeypatch: pytest.MonkeyPatch, setting: str, name: str
 ) -> None:
-    closed = zenoh_mesh._closed
-    monkeypatch.setattr(zenoh_mesh, "_closed", lambda security: without(closed(security), setting))
+    closed = zenoh_mesh._secured
+    monkeypatch.setattr(zenoh_mesh, "_secured", lambda security: without(closed(security), setting))
     async with Inside(lab) as inside:
         await inside.join("anvil")
         with bare(lab, **intruders(lab)[name]) as intruder:
