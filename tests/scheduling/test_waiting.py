@@ -61,7 +61,7 @@ def check_bound(workload: Workload, played: Replay, patience: Ns | Mapping[ArcId
     who is before them, somebody of higher priority needs an RC."""
     starts = {hold.arc: hold.start for hold in reversed(played.holds)}
     last = {hold.arc: hold.start for hold in played.holds}
-    longest = max(arrival.request.min_runtime for arrival in workload.arrivals)
+    longest = max(max(one.request.min_runtime, one.request.until_done) for one in workload.arrivals)
     patient = {arc: patience if isinstance(patience, int) else patience[arc] for arc in starts}
     tried = 0
     for arrival in workload.arrivals:
@@ -122,6 +122,26 @@ def test_nobody_waits_longer_than_promised_for_what_is_kept(seeds: Sequence[int]
         outstayed += sum(hold.end - hold.start > runtime[hold.arc] for hold in played.holds)
     assert tried > len(seeds), "hardly anybody had to wait for his patience: these runs prove nothing"
     assert outstayed > len(seeds), "hardly anything was kept"
+
+
+@pytest.mark.parametrize("seeds", in_parts(SEEDS, quick=70, size=465))
+def test_nobody_waits_longer_than_promised_beside_commands(seeds: Sequence[int]) -> None:
+    tried, longer = 0, 0
+    for seed in seeds:
+        draw = random.Random(f"commands {seed}")  # noqa: S311
+        work = changed(workload(seed), lambda one, draw=draw: as_command(one, draw))
+        played = replay(work, strategy=Adaptive(), policy=POLICY)
+        tried += check_bound(work, played, PATIENCE)
+        runtime = {one.request.arc: one.request.min_runtime for one in work.arrivals if one.request.until_done}
+        longer += sum(hold.end - hold.start > runtime.get(hold.arc, hold.end) for hold in played.holds)
+    assert tried > len(seeds) // 3, "hardly anybody had to wait for his patience: these runs prove nothing"
+    assert longer > len(seeds), "hardly any command held for longer than it ranks by"
+
+
+def as_command(request: ArcRequest, draw: random.Random) -> ArcRequest:
+    if draw.random() < 0.5:
+        return request
+    return structs.replace(request, keep=True, until_done=draw.randint(1, 12) * SECOND)
 
 
 def of_classes(seed: int) -> Workload:
