@@ -21,7 +21,7 @@ BASE, ME = f"zscout/{FLEET}", f"{HOST}/{NAME}"
 
 
 def ask(session: zenoh.Session, key: str, message: dict) -> dict | None:
-    """Send a query; return its answer, or None where nobody answers."""
+    """Send a query; return its answer, or None without an answer."""
     how = {"target": zenoh.QueryTarget.ALL, "consolidation": zenoh.ConsolidationMode.NONE, "timeout": 5.0}
     for reply in session.get(f"{BASE}/{key}", payload=json.dumps(message), **how):
         if reply.ok is not None:
