@@ -106,6 +106,19 @@ def test_a_path_of_source_that_a_page_names_exists(page: Path) -> None:
     assert {word for word in named if not exists(word)} == set()
 
 
+def test_a_function_that_the_page_of_questions_names_is_in_its_file() -> None:
+    page = (ROOT / "docs" / "architecture" / "questions.md").read_text()
+    named = {
+        (Path("zscout") / path, name)
+        for path, names in re.findall(r"`([\w/]+\.py)`: ((?:`\w+`(?:, )?)+)", page)
+        for name in re.findall(r"`(\w+)`", names)
+    }
+    assert len(named) > 20
+    kinds = ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef
+    found = {(path, node.name) for path, tree in MODULES.items() for node in ast.walk(tree) if isinstance(node, kinds)}
+    assert named - found == set()
+
+
 @pytest.mark.parametrize("page", PAGES[:2], ids=lambda page: page.name)
 def test_a_file_that_a_page_links_exists(page: Path) -> None:
     assert {link for link in LINK.findall(page.read_text()) if not (page.parent / link).exists()} == set()

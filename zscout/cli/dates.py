@@ -1,4 +1,4 @@
-"""Dates as people write them, in a time zone. Pure, except `host_zone`.
+"""Dates as people write them, in the zone of `--zone`, else in `host_zone`. Pure, except `host_zone`.
 
 When clocks are put back or forward, a local time may come twice or never. RFC 5545 (3.3.5) decides: the first of the
 two; or the time as if clocks had not been put forward yet. A note explains the choice to the user."""

@@ -1,7 +1,10 @@
 """A resource controller (RC) on the mesh: the part that every driver shares.
 
 A driver (`driver.py`) controls its device; `ResourceController` owns the keys, checks every command against the hold in
-force when it is carried out, votes, and puts the device into its safe state when its holder is gone."""
+force when it is carried out, votes, and puts the device into its safe state when its holder is gone.
+
+A node that loses the mesh receives no publication of a leader: after the hold lease `HoldTable.expire` (`holds.py`)
+ends the holds, and `_make_safe` follows."""
 
 from __future__ import annotations
 

@@ -1,7 +1,8 @@
 """The time for which an unwell RC keeps its holders, or remains available while free. Pure; time is passed in.
 
-A device that stops answering may be rebooting in its holder's own test. Until the deadline its RC is *unwell*,
-afterwards lost. The time counts from the failure, or from the later begin or end of the hold."""
+A device that stops answering may be rebooting in its holder's own test. Its driver calls `RcHandle.unwell`. Until the
+deadline the RC is *unwell*, afterwards lost. The time counts from the failure, or from the later begin or end of the
+hold."""
 
 from __future__ import annotations
 

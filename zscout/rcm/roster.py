@@ -1,6 +1,7 @@
 """The present RCs and clients of one term. Tokens, reports and answers go in, an Outbox comes out. Pure.
 
 An RC may be granted once it has promised to obey this term. A client with requests must show a token within a lease.
+A client whose token disappears is lost, and the core ends its ARCs; if this leader was away, the client has a lease.
 An RC that reports holds of earlier terms is pending until its gangs have answered (rule 8 of the protocol)."""
 
 from __future__ import annotations
