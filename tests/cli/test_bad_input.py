@@ -52,7 +52,7 @@ request robot/a --again | --again repeats a command; add one after --
 request robot/a --notify-signal USR1 | --notify-signal is for a command; add one after --
 request robot/a --notify-signal KILL -- true | --notify-signal: "KILL" is not a signal that a command can catch
 request robot/a --min-runtime never | --min-runtime: "never" is not a duration
-request robot/a --min-runtime 0 | --min-runtime must be positive, and is 0; write more than 0, at most 3660 d
+request robot/a --min-runtime 0 | --min-runtime must be positive, but is 0; write more than 0, at most 3660 d
 request robot/a --for 1h | there is no option --for; did you mean --min-runtime or --release-after? (see zscout request
 usage --user ada | there is no option --user (see zscout usage --help)
 maintain robot/a --reason stuck | there is no option --reason; did you mean --comment?
@@ -78,12 +78,12 @@ request --booking x --release-after 5 | --release-after can't be used with --boo
 request --booking x --dry-run | --dry-run can't be used with --booking; leave it out
 take framegrabber/*#0 | pattern "framegrabber/*#0" is not valid; write kind/name with * for a whole name or $* for a
 take robot/a:= | parameter "" is not valid; use 1 to 64 of A-Z a-z 0-9 _ . -; write parameter=number, as in
-take robot/a --min-runtime 0 | --min-runtime must be positive, and is 0
+take robot/a --min-runtime 0 | --min-runtime must be positive, but is 0
 request robot/a --infra-exit 256 | --infra-exit: 256 is out of range; write 1 to 255
 request robot/a --json-file /none/events | --json-file "/none/events" can't be written (No such file or directory)
 acquire robot/a --for 1h -- true | acquire runs no command; write zscout run TOKEN -- COMMAND after it
 acquire robot --for 1h | device "robot" is not valid; write kind/name, as in robot/scout33
-acquire robot/a --for 0 | --for must be positive, and is 0; write more than 0, at most 3660 d
+acquire robot/a --for 0 | --for must be positive, but is 0; write more than 0, at most 3660 d
 run survey-000000000000 | -- COMMAND is missing (see zscout run --help)
 run survey-000000000000 -- true | unknown token "survey-000000000000"
 run robot/a -- true | unknown token "robot/a"; robot/a is a device: zscout request robot/a -- COMMAND
@@ -92,7 +92,7 @@ drive radio/rf0 | "radio/rf0" is not a robot; name one, as in robot/NAME
 drive robot/a | standard input is not a terminal, and zscout drive reads keys; run it at a terminal
 drive robot/a --speed 9 | --speed: 9.0 is out of range; write 0.1 to 1.0
 motion --source none.avi | "none.avi" can't be read (No such file or directory); name a video file, a URL or a device
-motion --source none.avi --limit 0 | --limit must be positive, and is 0
+motion --source none.avi --limit 0 | --limit must be positive, but is 0
 cancel '' | "" can't be the name of a request; see zscout status
 cancel \\a | "\\x07" can't be the name of a request; see zscout status
 why '' | "" can't be the name of a request; see zscout status
@@ -110,7 +110,7 @@ book robot/a robot/a --for 1h --at 9:00 | robot/a is named twice; name each devi
 book robot/a --for 1h --at 9:00 --name 'a b' | --name "a b" is not valid; use 1 to 64 of A-Z a-z 0-9 _ . -
 maintain robot/a --broken x --well | zscout: --broken and --well exclude each other; use only one of them
 maintain robot/a --broken x --for 1h | zscout: --for can't be used with --broken, which has no date; leave it out
-maintain anvil --broken x | zscout: anvil is no device; name devices, or use zscout drain anvil
+maintain anvil --broken x | zscout: anvil is not a device; name devices, or use zscout drain anvil
 maintain robot/a --broken '' | zscout: --broken: the reason is empty; write what is wrong
 maintain 'robot/a b' --for 1h --at 9:00 | device name "a b" is not valid; use 1 to 64 of A-Z a-z 0-9 _ . -
 maintain 'a b' --for 1h --at 9:00 | host "a b" is not valid; use 1 to 64 of A-Z a-z 0-9 _ . -

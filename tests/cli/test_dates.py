@@ -103,14 +103,15 @@ def test_a_whole_day_is_only_one_where_days_are_asked_for() -> None:
     ("zone", "text", "at", "note"),
     [
         # Clocks go forward: as if they had not yet (RFC 5545, 3.3.5).
-        (BERLIN, "2027-03-28 02:30", "2027-03-28T03:30:00+02:00", "does not exist in Europe/Berlin: 03:30 is taken"),
+        (BERLIN, "2027-03-28 02:30", "2027-03-28T03:30:00+02:00",
+         "does not exist in Europe/Berlin: 03:30 is used instead"),
         (NEW_YORK, "2007-03-11 02:30", "2007-03-11T03:30:00-04:00",
-         "does not exist in America/New_York: 03:30 is taken"),
+         "does not exist in America/New_York: 03:30 is used instead"),
         # Clocks go back: the first.
         (BERLIN, "2026-10-25 02:30", "2026-10-25T02:30:00+02:00",
-         "comes twice in Europe/Berlin: the first is taken, the other is 2026-10-25T02:30+01:00"),
+         "comes twice in Europe/Berlin: the first is used, the other is 2026-10-25T02:30+01:00"),
         (NEW_YORK, "2026-11-01 01:30", "2026-11-01T01:30:00-04:00",
-         "comes twice in America/New_York: the first is taken, the other is 2026-11-01T01:30-05:00"),
+         "comes twice in America/New_York: the first is used, the other is 2026-11-01T01:30-05:00"),
         (BERLIN, "2026-10-25 03:00", "2026-10-25T03:00:00+01:00", ""),
         (BERLIN, "2027-03-28 03:00", "2027-03-28T03:00:00+02:00", ""),
     ],
@@ -137,8 +138,8 @@ def test_of_a_series_the_hours_that_a_day_has_not_or_twice_are_told() -> None:
     found = series(start, 1, datetime(2027, 3, 30, tzinfo=BERLIN).timestamp(), BERLIN)
     assert [f"{one:%m-%d %H:%M}" for one in found if one.hour != 2] == ["03-28 03:30"]
     assert remarks([int(one.timestamp()) for one in found], BERLIN, time(2, 30)) == [
-        "2026-10-25 02:30 comes twice in Europe/Berlin: the first is taken, the other is 2026-10-25T02:30+01:00",
-        "2027-03-28 02:30 does not exist in Europe/Berlin: 03:30 is taken",
+        "2026-10-25 02:30 comes twice in Europe/Berlin: the first is used, the other is 2026-10-25T02:30+01:00",
+        "2027-03-28 02:30 does not exist in Europe/Berlin: 03:30 is used instead",
     ]
 
 

@@ -115,7 +115,7 @@ BAD_FLEETS_BY_TEXT = {
         'mesh.listen[0]: "tcp/0.0.0.0:7447" is not TLS; write tls/host:port, or remove [security]'
     ),
     CLOSED + '[fleet]\ncandidates = ["b"]': "fleet.candidates[0]: b is not a manager; name it as one under [roles]",
-    CLOSED + '[devices]\nb = ["robot/x"]': "devices.b: b may not serve robot/x; name it under [roles.node], b",
+    CLOSED + '[devices]\nb = ["robot/x"]': "devices.b: b may not serve robot/x; add it to b under [roles.node]",
 }
 
 

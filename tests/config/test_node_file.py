@@ -38,7 +38,9 @@ BAD_NODES = {
     '[mesh]\nrelay = ["a"]': 'mesh.relay: joins a to no other site; name the sites, as in ["north", "south"]',
     '[mesh]\nrelay = ["a", "b"]\n[recorder]': "recorder: a relay can't record; record on the node of a site",
     '[mesh]\nsite = "a"\nrelay = ["a", "b"]': "mesh.site: a relay belongs to no single site; remove site, or relay",
-    '[mesh]\ninterface = "a b"': 'mesh.interface: "a b" is not an interface; write "auto", or as in "eth0"',
+    '[mesh]\ninterface = "a b"': (
+        'mesh.interface: "a b" is not an interface; write "auto", or the name of one, as in "eth0"'
+    ),
     '[rc]\nname = "robot/a"': "rc: is a table; write tables, each under [[rc]]",
     "rc = [1]": "rc[0]: is 1; write a table",
     '[[rc]]\ndriver = "exclusive"': "rc[0].name: is missing; add it",

@@ -126,7 +126,7 @@ def test_the_gang_settles_the_source(
 def test_a_framegrabber_that_can_not_be() -> None:
     rates = [(rate, 80, {"": "0"}) for rate in (0.0, float("nan"), float("inf"))]
     for rate, quality, sources in (*rates, (10.0, 0, {"": "0"}), (10.0, 101, {"": "0"}), (10.0, 80, dict[str, str]())):
-        with pytest.raises(ValueError, match="a framegrabber has a source"):
+        with pytest.raises(ValueError, match="a framegrabber needs a source"):
             FramegrabberDriver(sources, rate=rate, quality=quality)
 
 

@@ -55,7 +55,7 @@ BAD = {
     'arm\nport = "x"\nsped = 1': "rc[0].sped (arm/a): unknown key; did you mean speed?",
     'arm\nport = "x"\nbaud = 1': "rc[0].baud (arm/a): unknown key; known here: joints, port, speed",
     'arm\nport = "x"\nspeed = 101': "rc[0] (arm/a): speed is above 100, which bends it; write less; correct it",
-    'arm\nport = "gone"': "rc[0].driver (arm/a): zscout_arm.Arm can't be made: KeyError: 'gone'; fix that package, or",
+    'arm\nport = "gone"': "rc[0].driver (arm/a): zscout_arm.Arm can't be created: KeyError: 'gone'; fix that",
     "bare\nport = 1": "rc[0].port (arm/a): unknown key; known here: none",
     'odd\nport = "x"': "rc[0].driver (arm/a): the options of zscout_arm.Odd can't be read: rc[0].port has an "
     "unsupported type",

@@ -128,7 +128,7 @@ QUERIES: list[tuple[str, str, bytes | None, str, str]] = [
     ("vote: a term of one part", VOTE, proposal(term=[1]), "malformed", "at `$.term`"),
     ("command: not JSON", COMMAND, b"{", "malformed", "not a valid Command"),
     ("command: no payload", COMMAND, None, "malformed", "`do`"),
-    ("command: no grant", COMMAND, command(grant=...), "no_grant", "obeys only under a grant"),
+    ("command: no grant", COMMAND, command(grant=...), "no_grant", "takes commands only under a grant"),
     ("command: a grant in words", COMMAND, command(grant="mine"), "malformed", "at `$.grant`"),
     ("command: a list to do", COMMAND, command(do=[]), "malformed", "at `$.do`"),
     ("command: ttl 0", COMMAND, command(ttl=0), "bad_command", "ttl must lie between 0 and 60"),
@@ -142,8 +142,8 @@ QUERIES: list[tuple[str, str, bytes | None, str, str]] = [
     ("command: by a bad name", "rc/robot/a/command/t/a b", command(), "bad_name", 'client "a b"'),
     ("RC state: not JSON", "rc/robot/a/state", b"}", "malformed", "not a valid RcAsk"),
     ("RC state: a promise in words", "rc/robot/a/state", b'{"promise":"me"}', "malformed", "at `$.promise`"),
-    ("RC state: an old promise", "rc/robot/a/state", b'{"promise":[0,"x"]}', "old_term", "obeys term"),
-    ("RC state: a negative one", "rc/robot/a/state", b'{"promise":[-1,"x"]}', "old_term", "obeys term"),
+    ("RC state: an old promise", "rc/robot/a/state", b'{"promise":[0,"x"]}', "old_term", "has promised to obey term"),
+    ("RC state: a negative one", "rc/robot/a/state", b'{"promise":[-1,"x"]}', "old_term", "has promised to obey term"),
     ("RC state: an absurd promise", "rc/robot/a/state", b'{"promise":[%d,""]}' % HIGH, "old_term", "obeys"),
 ]  # fmt: skip
 
@@ -191,11 +191,11 @@ def test_one_client_one_host_and_all_together_may_wait_with_so_many(stranger: St
             if client == "t/many0":
                 [(kind, answer)] = stranger.get("rcm/schedule/t/many0", bad(id="n6"))
                 assert (kind, answer["code"]) == ("err", "too_many")
-                assert "t/many0 already has 5 open requests, the most" in answer["message"]
+                assert "t/many0 already has 5 open requests, the most allowed" in answer["message"]
             if client == "t/many2":
                 [(kind, answer)] = stranger.get("rcm/schedule/t/more", bad())
                 assert (kind, answer["code"]) == ("err", "too_many")
-                assert "clients of t already have 15 open requests, the most" in answer["message"]
+                assert "clients of t already have 15 open requests, the most allowed" in answer["message"]
         [(kind, answer)] = stranger.get("rcm/schedule/other/more", bad())
         assert (kind, answer["code"]) == ("err", "queue_full")
         assert "20 requests already wait" in answer["message"]

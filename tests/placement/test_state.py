@@ -20,7 +20,7 @@ def test_a_move_that_the_table_lacks_is_an_error_and_changes_nothing() -> None:
             record.enter(after)
             assert record.state == after
             continue
-        with pytest.raises(ValueError, match=f"counter: from {before} to {after}"):
+        with pytest.raises(ValueError, match=f"counter can't go from {before} to {after}"):
             record.enter(after)
         assert record.state == before
 

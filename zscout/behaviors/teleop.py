@@ -90,7 +90,7 @@ class Pilot:
     def __init__(self, speed: float = 0.6) -> None:
         """`speed` is the share of top speed, above 0 and at most 1; raises ValueError for others."""
         if not 0 < speed <= 1:
-            raise ValueError(f"speed {speed:g} is not above 0 and at most 1")
+            raise ValueError(f"speed is {speed:g}; it must be above 0 and at most 1")
         self.speed = speed
         self._ways: dict[Way, tuple[float, float]] = {}
         """By direction: time of the key's last press, and the time until which it drives."""

@@ -169,8 +169,8 @@ async def state_of(client: Client, arc: str | None = None, *, forecast: bool = F
 
 
 async def ask_nodes(mesh: Mesh, message: Message, kind: type[T], timeout: float) -> list[Reply[T]]:
-    """Return the answers of all nodes to a question about components. A secured fleet lets no node answer on the shared
-    key, so each node is asked on its own key."""
+    """Return the answers of all nodes to a question about components. In a secured fleet no node may answer on the
+    shared key, so each node is asked on its own."""
     keys = mesh.keys
     if not keys.closed:
         return await mesh.ask(keys.component_any(mesh.me), message, kind, timeout=timeout)

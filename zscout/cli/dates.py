@@ -166,9 +166,11 @@ def local(naive: datetime, zone: ZoneInfo) -> Found:
         return Found(first)
     if before < after:  # clocks go forward
         at = datetime.fromtimestamp(first.timestamp(), zone)
-        return Found(at, f"{naive:%Y-%m-%d %H:%M} does not exist in {zone.key}: {at:%H:%M} is taken", exists=False)
+        return Found(
+            at, f"{naive:%Y-%m-%d %H:%M} does not exist in {zone.key}: {at:%H:%M} is used instead", exists=False
+        )
     other = f"{second:%Y-%m-%dT%H:%M}{second.isoformat()[-6:]}"
-    return Found(first, f"{naive:%Y-%m-%d %H:%M} comes twice in {zone.key}: the first is taken, the other is {other}")
+    return Found(first, f"{naive:%Y-%m-%d %H:%M} comes twice in {zone.key}: the first is used, the other is {other}")
 
 
 def remarks(dates: Iterable[int], zone: ZoneInfo, hour: time) -> list[str]:

@@ -104,7 +104,8 @@ class CertificateAuthority:
         if manager:
             if (places := read_places_key(self.folder)) is None:
                 raise Where(str(self.folder / PLACES_KEY)).bad(
-                    "there is no such file", "copy it from the folder of the CA that issued the first manager"
+                    "there is no such file",
+                    "copy it from the folder of the CA that issued the first manager's certificate",
                 )
             write_durably(folder / PLACES_KEY, f"{places.hex()}\n".encode(), PRIVATE)
         return self._write(folder, name, lasts, now, _new_key())

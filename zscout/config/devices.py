@@ -240,7 +240,7 @@ def _check_rc(rc: BuiltInRc, at: Where) -> None:
             amounts(rc.capacity, at / "capacity")
         case CommandRc():
             if not (rc.start or rc.stop or rc.safe or rc.health):
-                raise (at / "safe").bad("and every other command are missing", f"add one, as in {A_COMMAND}")
+                raise (at / "safe").bad("is missing, and so are start, stop and health", f"add one, as in {A_COMMAND}")
             for name in ("start", "stop", "safe", "health"):
                 _check_words(getattr(rc, name), at / name)
             for parameter in rc.parameters:

@@ -431,7 +431,7 @@ def check_security(fleet: Fleet, top: Where) -> None:
     for host, rcs in fleet.devices.items():
         for rc in rcs:
             if not access.may_serve(host, rc):
-                raise (top / "devices" / host).bad(f"{host} may not serve {rc}", f"name it under [roles.node], {host}")
+                raise (top / "devices" / host).bad(f"{host} may not serve {rc}", f"add it to {host} under [roles.node]")
 
 
 def _check_devices(devices: Mapping[str, tuple[str, ...]], at: Where) -> None:
@@ -473,7 +473,9 @@ def check_links(listen: tuple[str, ...], connect: tuple[str, ...], interface: st
                 raise where.bad(f"{quoted(endpoint)} has no valid port", f"write one from {lowest_port} to 65535")
         check_unique(endpoints, at / name)
     if not _INTERFACE.fullmatch(interface):
-        raise (at / "interface").bad(f"{quoted(interface)} is not an interface", 'write "auto", or as in "eth0"')
+        raise (at / "interface").bad(
+            f"{quoted(interface)} is not an interface", 'write "auto", or the name of one, as in "eth0"'
+        )
 
 
 def check_sites(mesh: MeshConfig, at: Where) -> None:

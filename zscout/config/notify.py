@@ -82,7 +82,9 @@ def read_notify(table: NotifyTable, folder: Path, at: Where) -> NotifyConfig:
         raise at.bad("has neither urls nor users", "add either, or remove the table")
     for user in table.users:
         if not user or len(user) > MAX_NAME or not user.isprintable():
-            raise (at / "users").bad(f"{quoted(user)} is not a user", f"write 1 to {MAX_NAME} printable characters")
+            raise (at / "users").bad(
+                f"{quoted(user)} is not a user name", f"write 1 to {MAX_NAME} printable characters"
+            )
     shared = [*_written(table.urls, folder, at / "urls")]
     by_user = {user: [*_written(urls, folder, at / "users" / user)] for user, urls in table.users.items()}
     distinct = dict.fromkeys(written.url for urls in (shared, *by_user.values()) for written in urls)

@@ -132,7 +132,7 @@ class Driver:
 
     async def command_without_grant(self, sender: Sender, do: Mapping[str, Any]) -> Any:
         """Carry out a command that needs no hold. Raises Refused by default."""
-        raise Refused("no_grant", "this device obeys only under a grant; request it")
+        raise Refused("no_grant", "this device takes commands only under a grant; request the device first")
 
     def vote(self, holders: list[ProposedHolder]) -> str:
         """Return why a sharable device can't serve these holders together, or an empty string if it can serve them

@@ -82,7 +82,7 @@ class FramegrabberDriver(Driver):
         motion: MotionLimits | None = None,
     ) -> None:
         if not sources or not 0 < rate < math.inf or not 1 <= quality <= 100:
-            raise ValueError("a framegrabber has a source, a rate above 0 and a quality of 1 to 100")
+            raise ValueError("a framegrabber needs a source, a rate above 0 and a quality of 1 to 100")
         self._sources = dict(sources)
         self._receives = ", ".join(sorted(sources))
         self._rate, self._quality, self._motion = rate, quality, motion

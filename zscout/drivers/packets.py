@@ -67,7 +67,7 @@ class DrivePacket(Packet):
         if not (-1 <= self.left <= 1 and -1 <= self.right <= 1):
             raise ValueError(f"wheels {self.left:g}, {self.right:g} are not within -1 to 1")
         if not 0 < self.lasts <= MAX_LASTS:
-            raise ValueError(f"lasts {self.lasts:g} is not above 0 and at most {MAX_LASTS:g} s")
+            raise ValueError(f"lasts is {self.lasts:g} s; it must be above 0 and at most {MAX_LASTS:g} s")
 
 
 @dataclass(frozen=True, slots=True)

@@ -100,7 +100,7 @@ def _make(rc: PluginRc, driver: type[Driver]) -> Driver:
     except ValueError as error:
         raise rc.at.bad(str(error) or "the driver does not accept a value", "correct it") from error
     except Exception as error:
-        raise _unfit(rc.at / "driver", f"{driver.__module__}.{driver.__qualname__} can't be made", error) from error
+        raise _unfit(rc.at / "driver", f"{driver.__module__}.{driver.__qualname__} can't be created", error) from error
 
 
 def _origin(entry: metadata.EntryPoint) -> str:

@@ -347,7 +347,9 @@ class ResourceController:
             self._last_terms.shown(promise, self.holds.term)
         promised = promise is not None and self.holds.promise(promise, self.mesh.now(), above=above)
         if promise is not None and not promised and not query.message.ordinary:
-            raise Refused("old_term", f"{self.name} obeys term {self.holds.term.counter}", self.holds.term)
+            raise Refused(
+                "old_term", f"{self.name} has promised to obey term {self.holds.term.counter}", self.holds.term
+            )
         if promise is not None and promised:
             if query.message.instance in (None, self.instance):
                 self._asked = promise

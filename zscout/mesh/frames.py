@@ -103,7 +103,7 @@ class FrameWatch:
             if len(jpeg) > MAX_FRAME:
                 raise Malformed(f"{len(jpeg)} bytes are too many for a frame")
             if attachment is None:
-                raise Malformed("a frame without its head")
+                raise Malformed("a frame without its header")
             head: FrameHead = messages.decode(attachment, FrameHead, MAX_HEAD)
         except Malformed as error:
             self.malformed += 1

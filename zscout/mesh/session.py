@@ -108,8 +108,8 @@ class Inbox:
         return self._put(_Item(state, lane, host, call, args))
 
     def behind(self, lane: Lane, host: str, call: Callable[..., None], *args: Any) -> bool:
-        """Call `call(*args)` after the surplus of `host`. Return False, and do nothing, if the call need not wait: the
-        host has no surplus, and for a question nothing else waits. Raises Refused if too many calls wait there."""
+        """Queue `call(*args)` in the surplus of `host`. Return False, without queueing, if the call need not wait: the
+        host has no surplus, and, for a question, nothing else waits. Raises Refused if this surplus is too long."""
         of = lane, host
         if of not in self.surplus and not (lane is Lane.QUESTION and (self.ready or self.items or self.surplus)):
             return False

@@ -431,7 +431,7 @@ class ZenohTransport(Transport):
             else:
                 self._session.get(key, _collecting(to), timeout=timeout, payload=payload, encoding=encoding, **QUERY)
         except zenoh.ZError as error:
-            raise MeshError(f"{key} can't be asked: {error}") from None
+            raise MeshError(f"{key} can't be queried: {error}") from None
 
     def _querier(self, key: str, timeout: float) -> zenoh.Querier | None:
         """Return a querier, faster than a get, for a key that was queried before; None for others."""

@@ -70,8 +70,8 @@ class Message(msgspec.Struct, frozen=True, omit_defaults=True):
 
 
 class Problem(Message, frozen=True):
-    """A refusal. `term`, for a refusal because of a lower term: the term that the replier has promised. `left`, with
-    `settling`: seconds for which the RC may continue to answer so."""
+    """A refusal. `term` is set if the query's term was too low: the term that the replier has promised. `left` is set
+    with code `settling`: seconds for which the RC may continue to give this answer."""
 
     code: str
     message: str
@@ -128,7 +128,7 @@ def absurd(term: Term, known: Term, *, heard: bool = True) -> bool:
 
 
 def of_the_last(term: Term, known: Term) -> bool:
-    """Return True if `term` is absurd only because it is one of the last terms and `known` may be outdated."""
+    """Return True if `term` is absurd only because it is above LAST_TERMS: `known` may be outdated."""
     return max(LAST_TERMS, known.counter + 1) < term.counter <= MAX_COUNTER
 
 
@@ -251,10 +251,10 @@ def check_amount(value: Decimal, what: str) -> None:
     if not value.is_finite():
         raise ValueError(f"{what} must be a number, not {str(value)[:40]}")
     if value < 0:
-        raise ValueError(f"{what} must not be negative, and is {str(value)[:40]}")
+        raise ValueError(f"{what} must not be negative, but is {str(value)[:40]}")
     # A Fraction of 1e999999 would take all memory: look at the exponent before converting.
     if value and not -MAX_EXPONENT <= value.adjusted() <= MAX_EXPONENT:
-        raise ValueError(f"{what} must lie between 1e-{MAX_EXPONENT} and 1e{MAX_EXPONENT}, and is {str(value)[:40]}")
+        raise ValueError(f"{what} must lie between 1e-{MAX_EXPONENT} and 1e{MAX_EXPONENT}, but is {str(value)[:40]}")
     if len(value.as_tuple().digits) > MAX_DIGITS:
         raise ValueError(f"{what} has more than {MAX_DIGITS} digits")
 
@@ -268,10 +268,10 @@ def duration(value: Decimal, what: str) -> Ns:
     """Convert a positive duration from seconds to ns, rounded half to even. Raises ValueError."""
     check_amount(value, what)
     if value > MAX_SECONDS:
-        raise ValueError(f"{what} must be at most {MAX_SECONDS} s (ten years), and is {value}")
+        raise ValueError(f"{what} must be at most {MAX_SECONDS} s (ten years), but is {value}")
     nanoseconds = round(value * SECOND)
     if nanoseconds <= 0:
-        raise ValueError(f"{what} must be positive, and is {value}")
+        raise ValueError(f"{what} must be positive, but is {value}")
     return nanoseconds
 
 

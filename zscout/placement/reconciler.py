@@ -49,7 +49,8 @@ class Reconciler:
             self._given_twice(record, host, token=True)
 
     def vanished(self, token: TokenVanished) -> None:
-        """The host reports the cause; the network may also hide a token for a while."""
+        """A component's token has vanished: it ended, for a cause that its host reports, or the network hides it for a
+        while."""
         component, incarnation = token.component, token.incarnation
         record = self.state.get(component)
         self.surplus.token(component, incarnation, alive=False)

@@ -140,7 +140,7 @@ class ComponentRecord:
 
     def enter(self, state: ComponentState) -> None:
         if state not in TRANSITIONS[self.state] and state != self.state:
-            raise ValueError(f"{self.component}: from {self.state} to {state}")
+            raise ValueError(f"{self.component} can't go from {self.state} to {state}")
         self.state = state
 
     def status(self) -> Placement:

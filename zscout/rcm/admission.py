@@ -101,9 +101,11 @@ class Admission:
         if present.waiting_now >= limits.max_queued:
             raise Refused("queue_full", f"{limits.max_queued} requests already wait; try again later")
         if present.of_client(client) >= (most := limits.max_requests_per_client):
-            raise Refused("too_many", f"{client} already has {most} open requests, the most; cancel one")
+            raise Refused("too_many", f"{client} already has {most} open requests, the most allowed; cancel one")
         if present.of_owners((owner,)) >= (most := limits.max_requests_per_host):
-            raise Refused("too_many", f"clients of {owner} already have {most} open requests, the most; cancel one")
+            raise Refused(
+                "too_many", f"clients of {owner} already have {most} open requests, the most allowed; cancel one"
+            )
 
     def form(self, asked: Wanted, sender: Sender) -> ArcRequest:
         """The request, if its names and numbers are valid. Raises Refused."""

@@ -386,7 +386,7 @@ class Operations:
     def _forecast(self, ticket: Ticket, asked: Foresee, sender: Sender) -> None:
         arc, now = arc_id(str(sender), asked.id), self._now
         if self.core.arc(arc) is not None:
-            raise Refused("bad_request", f"{asked.id} is already a request; ask how it stands")
+            raise Refused("bad_request", f"{asked.id} is already a request; ask for its state instead")
         request = self._admission.admit(asked, sender, self)
         if asked.check:
             self._device_check.check(now, asked.needs, waits=asked.wait_for_device)

@@ -164,6 +164,6 @@ class Terms:
         return doubt is not None and doubt.since + silence <= now < doubt.until
 
     def doubted_until(self, host: HostName, now: Ns) -> Ns:
-        """The time until which `host` is not believed alone; 0: it is believed."""
+        """Until when a term that only `host` shows is ignored; 0 if it is believed."""
         doubt = self._doubts.get(host)
         return doubt.until if doubt is not None and now < doubt.until else 0

@@ -50,7 +50,7 @@ class FakeDevice(Driver):
     async def command(self, holder: Holder, do: Mapping[str, Any]) -> Any:
         name, value = do.get("name"), do.get("value")
         if not isinstance(name, str):
-            raise Refused("bad_command", "a command has a name")
+            raise Refused("bad_command", "a command needs a name")
         self.commands.append(dict(do))
         self._record(name, "" if value is None else str(value))
         return self.answers.get(name, value)

@@ -343,9 +343,9 @@ class MemoryTransport(Transport):
         try:
             zenoh.KeyExpr(key)
             if self.gone:
-                raise MeshError(f"{key} can't be asked: the session is closed")
+                raise MeshError(f"{key} can't be queried: the session is closed")
         except zenoh.ZError as error:
-            raise MeshError(f"{key} can't be asked: {error}") from None
+            raise MeshError(f"{key} can't be queried: {error}") from None
         get = _Get(self, timeout, to)
         queries = [
             (there, _Query(get, there.back, key, payload), queryable[1])

@@ -45,7 +45,7 @@ def test_what_began_can_be_booked_for_as_long_as_it_can_be_taken_up() -> None:
 @pytest.mark.parametrize(
     ("at", "every", "until", "why"),
     [
-        ("2026-11-26 11:59", None, None, "--at: .* 11:59 is past; the fleet's clock has Thu 2026-11-26 12:00"),
+        ("2026-11-26 11:59", None, None, "--at: .* 11:59 is past; the fleet's clock shows Thu 2026-11-26 12:00"),
         ("2028-01-01 10:00", None, None, "--at: .* is more than a year ahead"),
         ("tue 14:00", 7, "2026-11-30", "--until is before the first date"),
         ("tue 14:00", 7, "2027-12-30", "--until is more than a year ahead; write 2027-11-26 or an earlier"),

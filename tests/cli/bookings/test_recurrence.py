@@ -78,7 +78,7 @@ def test_a_count_is_of_all_dates_from_the_first_on(text: str, start: datetime) -
         ("COUNT=3", "its repetition is unknown: it can't be booked"),
         ("FREQ=DAILY;BYHOUR=9,10", "its repetition DAILY with BYHOUR can't be booked"),
         ("FREQ=WEEKLY;BYMONTH=3", "its repetition WEEKLY with BYMONTH can't be booked"),
-        ("FREQ=WEEKLY;BYDAY=2MO", "it repeats WEEKLY on numbered days, which no rule may do"),
+        ("FREQ=WEEKLY;BYDAY=2MO", "it repeats WEEKLY on numbered days, which RFC 5545 forbids"),
         ("FREQ=YEARLY;BYWEEKNO=20", "its repetition YEARLY with BYWEEKNO can't be booked"),
         ("FREQ=YEARLY;BYDAY=20MO", "it repeats YEARLY on days without a month, which can't be booked"),
         ("FREQ=DAILY;INTERVAL=0", "its INTERVAL or COUNT is not from 1 to 1000"),

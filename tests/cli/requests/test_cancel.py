@@ -41,7 +41,7 @@ def test_cancel_ends_a_wait_by_id(fleet: CliFleet) -> None:
     (view,) = fleet.state(lambda state: len(state.queue) == 1).queue
     refused = fleet.zscout("release", "survey")
     assert refused.returncode == 1
-    assert "holds nothing, it waits; to cancel it: zscout cancel survey" in refused.stderr
+    assert "is waiting and holds nothing; to cancel it: zscout cancel survey" in refused.stderr
     done = fleet.zscout("cancel", view.id, "--json")
     assert done.returncode == 0, done.stderr
     (arc,) = json.loads(done.stdout)["arcs"]

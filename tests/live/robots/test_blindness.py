@@ -110,7 +110,7 @@ async def test_jammed_and_silent_channels_are_left_and_a_dead_robot_is_lost(tmp_
         placed = Placed(lab, client, speed=1)
         channel, stalled = await placed.drives(), clock.now()
         building.stall(channel)
-        await placed.says("wait", f"video/ch{channel} shows nothing at all")
+        await placed.says("wait", f"video/ch{channel} receives no picture")
         await placed.drives(left=channel)
         print(f"stalled: drives on through the other channel after {(clock.now() - stalled) / SECOND:.1f} s")
         building.stall(channel, stalled=False)

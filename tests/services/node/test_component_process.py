@@ -107,7 +107,7 @@ def test_who_ends_before_it_has_answered_is_not_waited_for(tmp_path: Path) -> No
             Refused, match=r"it has ended, stopped|\w+ is not running on \w+; see zscout component list"
         ):
             await asking
-        with pytest.raises(Refused, match="it must run for that"):
+        with pytest.raises(Refused, match="only a running component can do this"):
             await process.checkpoint()
 
     process = play(tmp_path, "Restless", {}, story)

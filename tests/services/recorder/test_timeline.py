@@ -221,7 +221,7 @@ def test_hostile_names_and_texts_are_tamed(path: Path) -> None:
 def test_a_time_that_is_none_is_refused(tmp_path: Path, at: float) -> None:
     with (
         Timeline("lab", path=tmp_path / "run.rrd") as timeline,
-        pytest.raises(ValueError, match="is no time in seconds"),
+        pytest.raises(ValueError, match="is not a time in seconds"),
     ):
         timeline.event(at, "text")
 

@@ -42,14 +42,16 @@ BAD = {
     ),
     ("start = [2.6, 3.0]", "start = [2.6]"): ("wall[0].start: is not two numbers; write a place as [x, y]"),
     ("start = [2.6, 3.0]", "start = [2.6, 3.5]"): (
-        "wall[0].start: (2.6, 3.5) is outside; write x from 0 to 4, y from 0 to 3"
+        "wall[0].start: (2.6, 3.5) is outside the plan; write x from 0 to 4, y from 0 to 3"
     ),
     ("end = [2.6, 1.6]", "end = [2.6, 2.98]"): ("wall[0]: is shorter than 0.05 m; move its end"),
     ('kind = "sofa"', 'kind = "couch"'): (
         'furniture[0].kind (couch): is the text "couch"; '
         'write "bed", "chair", "desk", "raised", "shelf", "sofa", "solid" or "table"'
     ),
-    ("y = 2.4", "y = 3.4"): ("furniture[0] (couch): (1.2, 3.4) is outside; write x from 0 to 4, y from 0 to 3"),
+    ("y = 2.4", "y = 3.4"): (
+        "furniture[0] (couch): (1.2, 3.4) is outside the plan; write x from 0 to 4, y from 0 to 3"
+    ),
     ("height = 0.75", "height = 2.6"): ("furniture[0].height (couch): is 2.6 m; write at most 2.5, the room's"),
     ("height = 0.75", "height = 0.13"): (
         "furniture[0].clearance (couch): is 0.12 m; write at most 0.11, below the height"
@@ -61,7 +63,7 @@ BAD = {
     ("x = 0.0, ", "x = 0.5, "): ("light[1] (window): is not in an outer wall; put its x or y on an outer wall"),
     ("z = 1.5", "z = 0.4"): (
         "light[1].z (window): is 0.4 m, so the window leaves its wall; "
-        "give the height of its middle, half its depth or more from floor and ceiling"
+        "write the height of its middle, at least half its depth above the floor and below the ceiling"
     ),
     ("x = 2.0, y = 1.5", "x = 2.0, y = 1.5, z = 2.6"): (
         "light[0].z (ceiling): is 2.6 m; write at most 2.5, the room's height"
@@ -70,7 +72,7 @@ BAD = {
         "person[0].path (ada): has less than two points; write two or more, as in [[0.5, 1], [3, 1]]"
     ),
     ("[3.0, 1.0]]", "[5.5, 1.0]]"): (
-        "person[0].path[1] (ada): (5.5, 1) is outside; write x from -1 to 5, y from -1 to 4"
+        "person[0].path[1] (ada): (5.5, 1) is outside the plan; write x from -1 to 5, y from -1 to 4"
     ),
     ("[3.0, 1.0]]", "[-0.45, 1.0]]"): ("person[0].path (ada): has no length; move one of its points by 0.1 m or more"),
     ("[3.0, 1.0]]", "[1, 2, 3]]"): ("person[0].path[1] (ada): has 3 entries; at most 2 are allowed"),

@@ -139,8 +139,8 @@ class OutgoingMove:
         return await self._repeat_until_known(messages.ActivateComponent(self._name, self.incarnation))
 
     async def _stop_successor(self) -> bool:
-        """Stop the successor unless it runs already, for when the RCM's answer to the hand-over is lost: a running
-        successor has the ARCs. Return True if it has run, False if it never will."""
+        """Stop the successor, unless it runs: then it has the ARCs. Called when the RCM's answer to the hand-over is
+        lost. Return True if the successor has run, False if it never will."""
         reply = await self._ask(messages.ListComponents(self._name), messages.ComponentList, QUERY_TIMEOUT)
         if isinstance(reply, messages.ComponentList) and any(
             view.incarnation == self.incarnation and view.phase == "running" for view in reply.components

@@ -447,7 +447,7 @@ def reduced(picture: Picture) -> tuple[_Plane, float, float]:
     planes = picture.ndim in (2, 3) and picture.shape[2:] in ((), (3,))
     sides = all(8 <= side <= MAX_SIDE for side in picture.shape[:2])
     if picture.dtype != np.uint8 or not planes or not sides:
-        raise ValueError(f"no picture: {picture.dtype} of shape {picture.shape}; a side has 8 to {MAX_SIDE} pixels")
+        raise ValueError(f"not a picture: {picture.dtype} of shape {picture.shape}; a side has 8 to {MAX_SIDE} pixels")
     height, width = picture.shape[:2]
     if width > WIDTH:
         rows = max(8, round(height * WIDTH / width))

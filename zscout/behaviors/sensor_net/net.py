@@ -54,7 +54,7 @@ class SensorNet:
             raise ValueError("robots is empty or has duplicates; name each robot once")
         self.wanted = len(robots) if wanted is None else wanted
         if not 1 <= self.wanted <= len(robots):
-            raise ValueError(f"wanted is {wanted}; write 1 to {len(robots)}, the robots there are")
+            raise ValueError(f"wanted is {wanted}; write 1 to {len(robots)}, the number of robots")
         self.members = {robot: Member(robot) for robot in robots}
 
     @property

@@ -52,8 +52,8 @@ class Slots:
     watch: float = 30.0
 
     def of(self, task: Task, *, sooner: bool = False) -> tuple[int, float]:
-        """Priority and minimum runtime in seconds of a task's ARC. With `sooner` a turn is a little shorter: shorter
-        ones go first, until another request has exhausted its patience."""
+        """Priority and minimum runtime in seconds of a task's ARC. `sooner` shortens a watch a little, since shorter
+        requests are granted first, until another request has exhausted its patience."""
         if task == "hide":
             return self.hide_priority, self.hide
         return self.watch_priority, self.watch * (SOONER if sooner else 1)
@@ -161,7 +161,7 @@ class RobotTask(Behavior):
                 # Revoked because the receiver is dead: the same needs would bring it back.
                 await context.client.end(attempt.arc)
                 scout.no_signal = False
-                raise CameraBlind(f"{channel} shows nothing at all")
+                raise CameraBlind(f"{channel} receives no picture")
 
     async def _channel(self, context: BehaviorContext) -> str | None:
         """A channel to request by name, to avoid others."""

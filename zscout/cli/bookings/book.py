@@ -203,7 +203,7 @@ async def _report(needs: Sequence[str], broken: str | None, *, well: bool, as_js
         option = {"runtime": "for"}.get(given[0], given[0])
         raise BadInput(f"--{option} can't be used with {mode}, which has no date; leave it out")
     if hosts := [host for host in map(host_in, needs) if host is not None]:
-        raise BadInput(f"{hosts[0]} is no device; name devices, or use zscout drain {hosts[0]}")
+        raise BadInput(f"{hosts[0]} is not a device; name devices, or use zscout drain {hosts[0]}")
     async with common.connected("maintain") as client:
         client.who = replace(client.who or Who(), command="")
         bookings, me = BookingsClient(client), User.of(client)
@@ -254,13 +254,13 @@ class Asked:
         start, last = at.found(now, zone), None
         begins = start.at.timestamp()
         if begins + late <= now:
-            raise BadInput(f"--at: {date_words(begins, zone)} is past; the fleet's clock has {date_words(now, zone)}")
+            raise BadInput(f"--at: {date_words(begins, zone)} is past; the fleet's clock shows {date_words(now, zone)}")
         if begins > now + MAX_AHEAD:
             raise BadInput(f"--at: {date_words(begins, zone)} is more than a year ahead; write an earlier date")
         if every is None:
             return cls(start, 0, None, runtime, zone)
         if not start.exists:
-            raise BadInput(f"--at: {start.note}, and every repetition would; begin with another date")
+            raise BadInput(f"--at: {start.note}, also for repetitions; begin with another date")
         latest = last = _end_of(in_zone(now + LAST_DAY_AHEAD_S, zone).date(), zone)
         if until is not None:
             day = until.whole_day(now, zone)

@@ -82,7 +82,7 @@ def parse_rule(parts: Mapping[str, Sequence[Any]]) -> RepeatRule:
     if rule.until is not None and not isinstance(rule.until, date):
         raise ValueError("its UNTIL is not a date")
     if freq == "WEEKLY" and any(which for which, _ in days):
-        raise ValueError("it repeats WEEKLY on numbered days, which no rule may do")
+        raise ValueError("it repeats WEEKLY on numbered days, which RFC 5545 forbids")
     if freq == "YEARLY" and (days or rule.by_monthday) and not rule.by_month:
         raise ValueError("it repeats YEARLY on days without a month, which can't be booked")
     return rule

@@ -169,7 +169,9 @@ class Reader:
         if self._only and self._host is not None:
             for line in await absent(self._client.mesh, [self._host]):
                 return common.Failed(f"--host: {line}")
-            return common.Failed(f"{self._host} has no output of {self._name}; leave --host out to read its last host")
+            return common.Failed(
+                f"{self._host} has no output of {self._name}; leave --host out to read from the component's last host"
+            )
         if self._record is not None:
             return common.Failed(f"no host has output of {self._name}: it {state_words(self._record)}")
         return await unknown_here(self._placer, self._name)

@@ -78,7 +78,7 @@ async def _move(placer: PlacerClient, shown: placing.Progress, before: Placement
         if record.state == "running":
             if record.host != before.host:
                 return record
-            raise common.Failed(f"{name} was not moved, it keeps running on {record.host}: {record.reason}")
+            raise common.Failed(f"{name} was not moved; it is still running on {record.host}: {record.reason}")
     elif to == record.host:
         return record
     raise common.Failed(f"{name} was not moved: it {placing.state_words(record)}; {placing.remedy(record)}")

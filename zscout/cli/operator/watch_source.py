@@ -166,5 +166,5 @@ def _check(picture: NDArray[np.uint8], name: str) -> None:
     if min(height, width) < MIN_SIDE or max(height, width) > MAX_SIDE or height * width > MAX_PIXELS:
         raise BadInput(
             f"the pictures of {quoted(name)} are {width} by {height} pixels; each side must have {MIN_SIDE} to "
-            f"{MAX_SIDE} pixels, and all at most {MAX_PIXELS // 1_000_000} million"
+            f"{MAX_SIDE} pixels, and the picture at most {MAX_PIXELS // 1_000_000} million"
         )

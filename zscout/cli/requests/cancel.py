@@ -130,7 +130,9 @@ def _choose(state: RcmState, named: str, word: str, *, every: bool) -> list[Targ
         matching = [Target(request, check_name(request, "id"), str(client_of(client)), "queued")]
     found = [target for target in matching if word == "cancel" or target.was == "running"]
     if matching and not found:
-        raise common.Failed(f"request {quoted(named)} holds nothing, it waits; to cancel it: zscout cancel {named}")
+        raise common.Failed(
+            f"request {quoted(named)} is waiting and holds nothing; to cancel it: zscout cancel {named}"
+        )
     if not found:
         more = f"; {state.more} more wait: name them <host>/<client>/<id>" if state.more else ""
         raise common.Failed(f"no request {quoted(named)} holds or waits{more}; {_hint(state, named)}")

@@ -202,7 +202,7 @@ def placement(policies: tuple[Policy, ...], scenarios: tuple[str, ...], out: Pat
         try:
             out.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise BadInput(f"--out {out}: can't be made ({error.strerror}); give another folder") from None
+            raise BadInput(f"--out {out}: can't be created ({error.strerror}); give another folder") from None
     from zscout.simulation.demo.placement_run import play
 
     # In the order in which the options list them.

@@ -80,7 +80,7 @@ async def ask_journals(
     hosts = await _candidates(mesh, fleet, look)
     why = f"no journal of fleet {fleet.name} can be read"
     if not hosts:
-        raise NoCandidate(f"{why}: no node that keeps one is seen; see [journal] of a node file")
+        raise NoCandidate(f"{why}: no node with a journal is on the mesh; see [journal] of a node file")
     slots = asyncio.Semaphore(AT_ONCE)
 
     async def page(host: HostName, question: HistoryAsk) -> History | None:

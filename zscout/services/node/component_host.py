@@ -216,7 +216,7 @@ class ComponentHost:
         own = process.start.incarnation
         if incarnation is not None and incarnation != own:
             code = old if incarnation < own else "unknown_component"
-            raise Refused(code, f"{name} is here as incarnation {own}, not {incarnation}")
+            raise Refused(code, f"{name} has incarnation {own} on this host, not {incarnation}")
         return process
 
     def _on_over(self, process: ComponentProcess) -> None:

@@ -147,7 +147,9 @@ class ComponentProcess:
 
     async def restore(self, order: RestoreComponent) -> ComponentView:
         if self.phase != "standby":
-            raise Refused("move_failed", f"it is {self.phase} here; only a component on standby is restored")
+            raise Refused(
+                "move_failed", f"it is {self.phase} on this host; only a component on standby can be restored"
+            )
         await self._ask(order, SLACK)
         return self.view()
 
@@ -159,7 +161,9 @@ class ComponentProcess:
 
     def _check_runs(self) -> None:
         if self.phase != "running":
-            raise Refused("bad_request", f"{self.start.component} is {self.phase} here; it must run for that")
+            raise Refused(
+                "bad_request", f"{self.start.component} is {self.phase} here; only a running component can do this"
+            )
 
     async def _ask(self, operation: channel.Operation, timeout: float | None) -> OrderAnswer:
         number = next(self._numbers)

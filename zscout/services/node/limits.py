@@ -117,7 +117,7 @@ class ControlGroups:
         return group_folders(self._root / controller, self._of.get(controller, ()))[-1]
 
     def _limit(self, group: ComponentGroup, controller: str, name: str) -> bool:
-        """Limit memory or processor time by a group of v1, else of v2."""
+        """Limit memory or processor time by a control group: of cgroup v1 if this controller is there, else of v2."""
         own, base, memory = self._own(controller), self._base(), str(group.memory)
         first, later = _quota(max(group.cpu, START_CORES)), _quota(group.cpu)
         also: dict[str, str] = {}

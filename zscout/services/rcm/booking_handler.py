@@ -179,7 +179,9 @@ class BookingHandler:
         dates = sum(booking.owner == record.owner for booking, _ in self._core.bookings())
         if dates + len(self._dates.open_dates(record)) > MAX_CLAIMS // 2:
             most = MAX_CLAIMS // 2
-            raise Refused("too_many", f"{record.owner} has {dates} dates booked, {most} at most; repeat it less often")
+            raise Refused(
+                "too_many", f"{record.owner} has {dates} dates booked, of at most {most}; repeat it less often"
+            )
 
     def _decide(self, ticket: Ticket, record: BookingRecord) -> bool:
         """Make the booking if all its dates in the window are free, refuse it if one is not; return False while votes
@@ -319,7 +321,7 @@ class BookingHandler:
             return
         if self._now >= undecided.until:
             self._refuse(
-                undecided.ticket, Refused("busy", "a shared device did not answer what it can carry; try again")
+                undecided.ticket, Refused("busy", "a shared device did not report what it can serve; try again")
             )
         else:
             self.undecided.append(undecided)

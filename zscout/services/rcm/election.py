@@ -134,7 +134,7 @@ class Election:
         self._not_before = max(self._not_before, now + RETRY)
 
     def outbid(self, now: Ns) -> None:
-        """RCs promised a higher term than was known: another candidate leads in it within a turn, or has failed."""
+        """RCs have promised a higher, unknown term. Wait a turn: by then its candidate leads or has failed."""
         self._not_before = now + TURN
 
     def deposed(self, now: Ns, jitter: float, *, led: bool = True) -> None:

@@ -77,7 +77,7 @@ class Drawing:
 
     def _reaches(self, at: float) -> None:
         if not abs(at) < MAX_SECONDS:
-            raise ValueError(f"timeline: {at} is no time in seconds; give a number below {MAX_SECONDS:g}")
+            raise ValueError(f"timeline: {at} is not a time in seconds; give a number below {MAX_SECONDS:g}")
         self.begin, self.end = min(self.begin, at), max(self.end, at)
 
     def point(self, at: float, entity: str, value: float) -> None:

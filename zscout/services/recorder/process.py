@@ -82,7 +82,7 @@ def decode_job(line: bytes) -> RecorderJob:
     try:
         return msgspec.json.decode(line, type=RecorderJob, dec_hook=lambda path, value: path(value))
     except (msgspec.MsgspecError, UnicodeDecodeError, TypeError) as error:
-        raise BadInput(f"standard input: no job for a recorder ({error}); let zscout-node start it") from None
+        raise BadInput(f"standard input: not a job of the recorder ({error}); let zscout-node start it") from None
 
 
 def new_recording(folder: Path, fleet: str) -> Path:

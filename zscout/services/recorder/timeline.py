@@ -144,7 +144,7 @@ class Timeline(Drawing):
         except OSError as error:
             raise TimelineError(
                 f"can't write the recording {path} ({error.strerror}); "
-                "give a file in a directory that is there and can be written"
+                "give a file in an existing directory that can be written"
             ) from error
         # A footer needs memory for each chunk, as long as a fleet is recorded. `finish` adds it.
         stream = self._open(rr.FileSink(path, write_footer=not self._wall), str(path), FILE_TICK)

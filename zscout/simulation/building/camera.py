@@ -192,7 +192,7 @@ class Camera:
         map_y: Floats,
         run: Floats,
     ) -> None:
-        """Write the same for pixels of boxes into the maps."""
+        """Overwrite the maps of `_wall_maps` where a box hides the wall."""
         boxes = self._boxes
         box = number[standing] - FIRST_BOX
         key = box * WIDTH + column[standing]

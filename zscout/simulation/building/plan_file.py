@@ -104,7 +104,7 @@ def _check_point(point: tuple[float, ...], plan: Plan, where: Where, beyond: flo
     x, y = point
     if not (-beyond <= x <= plan.width + beyond and -beyond <= y <= plan.depth + beyond):
         ends = [f"from {0 - beyond:g} to {size + beyond:g}" for size in (plan.width, plan.depth)]
-        raise where.bad(f"({x:g}, {y:g}) is outside", f"write x {ends[0]}, y {ends[1]}")
+        raise where.bad(f"({x:g}, {y:g}) is outside the plan", f"write x {ends[0]}, y {ends[1]}")
 
 
 def _check_piece(piece: Furniture, plan: Plan, where: Where) -> None:
@@ -130,7 +130,7 @@ def _check_light(light: Light, plan: Plan, where: Where) -> None:
         if not light.depth / 2 <= light.z <= plan.height - light.depth / 2:
             raise (where / "z").bad(
                 f"is {light.z:g} m, so the window leaves its wall",
-                "give the height of its middle, half its depth or more from floor and ceiling",
+                "write the height of its middle, at least half its depth above the floor and below the ceiling",
             )
 
 

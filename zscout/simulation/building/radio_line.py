@@ -218,7 +218,7 @@ def _point(link: Path, port: str) -> None:
             beside.unlink()
             raise
     except OSError as error:
-        raise BadInput(f"{link}: can't be made a link ({error.strerror}); {remedy}") from None
+        raise BadInput(f"{link}: the link can't be created ({error.strerror}); {remedy}") from None
 
 
 def _unpoint(link: Path, port: str) -> None:

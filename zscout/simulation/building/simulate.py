@@ -87,7 +87,7 @@ def _write_node(path: Path, text: str) -> None:
     try:
         path.write_text(text)
     except OSError as error:
-        raise BadInput(f"{path}: can't be written ({error.strerror}); give another --node") from None
+        raise BadInput(f"{path}: can't be written ({error.strerror}); name another file with --node") from None
 
 
 async def _publish(served: Served, mesh: Mesh) -> None:

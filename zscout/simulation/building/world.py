@@ -60,7 +60,7 @@ class World:
     def step(self, dt: float) -> None:
         """Advance by `dt` seconds, above 0 and at most MAX_STEP."""
         if not 0 < dt <= MAX_STEP + 1e-9:
-            raise ValueError(f"a step of {dt:g} s; it is above 0 and at most {MAX_STEP:g} s")
+            raise ValueError(f"a step is {dt:g} s; it must be above 0 and at most {MAX_STEP:g} s")
         parts = max(1, round(dt / _SUBSTEP))
         for _ in range(parts):
             self._move(dt / parts)

@@ -164,9 +164,9 @@ class Hider:
         except (msgspec.MsgspecError, UnicodeDecodeError) as problem:
             raise BadCheckpoint(f"not a checkpoint of a hider: {problem}") from problem
         if robot.form != FORM:
-            raise BadCheckpoint(f"a checkpoint of form {robot.form}, not {FORM}: start again")
+            raise BadCheckpoint(f"the checkpoint has form {robot.form}, not {FORM}; start without it")
         if {len(robot.tones), len(robot.anchor_tones)} - {0, BANDS * COLUMNS}:
-            raise BadCheckpoint("a checkpoint whose pictures have another size: start again")
+            raise BadCheckpoint("the checkpoint's pictures have another size; start without it")
         hider = cls()
         hider._robot = robot
         return hider
