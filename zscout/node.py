@@ -203,7 +203,8 @@ async def run_services(
                 finally:
                     keep_copies()
 
-            reload.takes(take_fleet, "roles", "groups", "access", "quotas", "ceilings", "devices", *LIMITS)
+            defaults = "fleet.min_runtime", "fleet.command_min_runtime"
+            reload.takes(take_fleet, "roles", "groups", "access", "quotas", "ceilings", "devices", *defaults, *LIMITS)
             reload.takes(take_rcs, "rc")
             reloading = asyncio.create_task(reload.serve(manager, status))
             stack.push_async_callback(_cancelled, reloading)

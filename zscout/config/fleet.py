@@ -369,7 +369,7 @@ def _fleet(file: FleetFile, top: Where, folder: Path = Path()) -> Fleet:
         security=None if file.security is None else keys_folder(file.security, folder, top),
         access=access,
         min_runtime=min(table.min_runtime, policy.max_runtime or table.min_runtime),
-        command_min_runtime=min(table.command_min_runtime, policy.max_runtime or table.command_min_runtime),
+        command_min_runtime=table.command_min_runtime,
     )
     check_security(fleet, top)
     return fleet

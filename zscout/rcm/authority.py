@@ -115,8 +115,8 @@ class Authority:
         """How long a hold of this name for a command is protected; 0: no longer than `min_runtime`. A request that
         gives less than the fleet's minimum runtime, and so ranks before others, has no more than that."""
         usual, most = self._runtimes
-        longest = self.longest_runtime(name) or most
-        return min(most, longest) if min_runtime >= usual else 0
+        limits = (most, self.longest_runtime(name) or most, self.limits.max_runtime or most)
+        return min(limits) if min_runtime >= usual else 0
 
     def starter(self, client: ClientId) -> str:
         """The name whose quotas count a component's requests: it acts for whoever started it, on the host that the

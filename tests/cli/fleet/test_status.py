@@ -80,7 +80,7 @@ async def test_the_fleet_is_shown_to_people_and_programs(lab: Lab) -> None:
     assert hosts[state.host][1] == "leads"
     assert " of " in hosts["anvil"][2]
     assert hosts["anvil"][-1] == "node, 2 devices"
-    assert hosts["test"][1:] == ["alive", "-", "-", "-", "2 clients"]
+    assert hosts["test"][1:] == ["no node", "-", "-", "-", "2 clients"]
     assert "\x1b" not in plain.stdout
 
     def told(done: subprocess.CompletedProcess[str]) -> bool:

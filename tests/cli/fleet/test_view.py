@@ -217,7 +217,7 @@ async def test_where_a_node_of_this_host_records_its_recording_is_shown(lab: Lab
         said = await asyncio.to_thread(said_as_json, lab.folder, process)
         assert said["live"] == f"rerun+http://127.0.0.1:{port}/proxy"
         assert [Path(said["file"])] == list((lab.folder / "runs").glob("*.rrd"))
-        assert "--past: a node records" in (lab.folder / "view.log").read_text()
+        assert "--past is ignored: a node records" in (lab.folder / "view.log").read_text()
         # No second recorder was started.
         assert [child.name() for child in descendants(process)] == ["rerun"]
         assert not (lab.folder / "out").exists()
