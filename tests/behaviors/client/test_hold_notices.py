@@ -40,9 +40,9 @@ def test_the_words_have_the_times() -> None:
     assert notice().text(0) == f"next (h/c) waits for {RC}: yours for 60 s"
     assert notice(safe=0).text(0) == f"next (h/c) waits for {RC}: the hold may end at any time"
     booked = notice("survey", code="booked", begins=30)
-    assert (
-        booked.text(0, lambda seconds: f"T{seconds:.0f}") == f"survey (h/c) has booked {RC} from T30: yours until T60"
-    )
+    with_clock = booked.text(0, lambda seconds: f"T{seconds:.0f}")
+    assert with_clock == f"survey (h/c) has booked {RC} from T30: the hold may end from T60 on"
+    assert booked.text(0) == f"survey (h/c) has booked {RC} in 30 s: the hold may end in 60 s"
     assert notice()._replace(withdrawn=True).text(0) == f"no request waits for {RC} any more"
 
 

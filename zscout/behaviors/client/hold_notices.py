@@ -51,18 +51,24 @@ class HoldNotice(NamedTuple):
         if self.withdrawn:
             return f"no request waits for {rcs} any more" if self.code == "waits" else f"{by} does not end the hold"
         left = (self.safe_until - now) / SECOND
-        yours = f"yours until {clock(left)}" if clock is not None else f"yours for {left:.0f} s"
-        yours = yours if left > 0 else "the hold may end at any time"
+        if left <= 0:
+            ends = "the hold may end at any time"
+        elif self.code == "waits":
+            ends = f"yours until {clock(left)}" if clock is not None else f"yours for {left:.0f} s"
+        else:
+            ends = (
+                f"the hold may end from {clock(left)} on" if clock is not None else f"the hold may end in {left:.0f} s"
+            )
         if self.code == "waits":
-            return f"{by} waits for {rcs}: {yours}"
+            return f"{by} waits for {rcs}: {ends}"
         comment = self.by.who.comment if self.by.who is not None else ""
-        yours += f" ({clean(comment)})" if comment else ""
+        ends += f" ({clean(comment)})" if comment else ""
         away = (self.begins or now) - now
         date = clock(away / SECOND) if clock is not None else f"in {away / SECOND:.0f} s"
         date = f" from {date}" if clock is not None else f" {date}"
         date = date if away > 0 else " now"
         what = f"maintenance of {rcs} by {by}" if self.code == "maintenance" else f"{by} has booked {rcs}"
-        return f"{what}{date}: {yours}"
+        return f"{what}{date}: {ends}"
 
 
 class NoticeTracker:
