@@ -203,7 +203,7 @@ def test_an_rc_is_asked_about_few_sets_at_a_time_and_a_grant_waits_for_none() ->
             break
     # Each overlaps the one before it.
     assert asked == 399
-    assert most <= calendar.IN_FLIGHT
+    assert most <= calendar.MAX_IN_FLIGHT
     assert not [effect for effect in effects if isinstance(effect, (BookingThreatened, BookingConflict))]
 
 
@@ -267,9 +267,9 @@ def test_an_instant_is_bounded_and_asks_for_the_next(monkeypatch: pytest.MonkeyP
     instants = 0
     while WakeAt(0) in (effects := core.handle(0, Tick())):
         instants += 1
-        assert checked.total() <= calendar.WORK
+        assert checked.total() <= calendar.MAX_CHECKS
         checked.clear()
-    assert instants >= 2_000 // calendar.WORK
+    assert instants >= 2_000 // calendar.MAX_CHECKS
     assert not [effect for effect in effects if isinstance(effect, BookingThreatened)]
 
 

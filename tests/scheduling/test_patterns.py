@@ -175,9 +175,9 @@ def test_a_hold_keeps_its_rc_over_a_change_of_rcm_and_may_have_another_after_a_l
     assert held(core) == {"any": {"fg/a"}}
 
 
-def test_a_standing_hold_must_tell_what_it_holds() -> None:
+def test_a_recovered_hold_must_name_an_rc_for_each_pattern() -> None:
     for bound in ({}, {"fg/*": "robot/a"}, {"fg/*": "fg/a", "fg/*#2": "fg/b"}):
-        with pytest.raises(ValueError, match="what ARC any holds"):
+        with pytest.raises(ValueError, match="recovered hold of ARC any: `bound`"):
             RecoveredHold(request("any", "fg/*"), Place(TERM, 1), Grant(TERM, 1), 0, SECOND, bound)
 
 

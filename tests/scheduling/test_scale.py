@@ -273,7 +273,7 @@ def test_what_a_release_looks_at_does_not_grow_with_the_queue(monkeypatch: pytes
     assert looked_at == ["a57"]
     # What others wait for now is looked at when somebody reads it.
     following = [f"a{107 + 50 * step}" for step in range(priority.MAX_REPORTED)]
-    assert [effect.arc for effect in core.tell_reasons() if isinstance(effect, Queued)] == following
+    assert [effect.arc for effect in core.report_reasons() if isinstance(effect, Queued)] == following
     assert looked_at == ["a57", *following]
     assert not core.reasons_changed
 

@@ -11,7 +11,7 @@ ROOT = Path(__file__).parents[2]
 SURFACE = {
     "handle", "status", "arc", "is_queued", "waiting", "holders", "arcs_of", "arcs", "arcs_of_owners", "count_of",
     "count_of_owner", "is_open", "is_running", "place_of", "at_place", "could_have_issued", "reasons_changed",
-    "tell_reasons", "slots", "likely_slot", "ask_votes", "booking", "bookings", "charged",
+    "report_reasons", "slots", "likely_slot", "ask_votes", "booking", "bookings", "charged",
     "charged_in_all", "drained", "upcoming", "upcoming_changed", "contended_holds",
 }  # fmt: skip
 SURFACE |= {

@@ -86,7 +86,7 @@ class CorePlayer:
             return []
         decided = self.core.handle(self.now, *events)
         wakes = [one for one in decided if isinstance(one, model.WakeAt)]
-        effects = [*(one for one in decided if one not in wakes), *self.core.tell_reasons(), *wakes]
+        effects = [*(one for one in decided if one not in wakes), *self.core.report_reasons(), *wakes]
         validate(self.core)
         return [_print(effect) for effect in effects] or ["nothing"]
 

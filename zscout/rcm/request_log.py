@@ -304,7 +304,7 @@ class RequestLog:
         """The notices of changed reasons, and lines for the log, as far as they are due."""
         out = Outbox()
         if self._report_at is not None and self._report_at <= now:
-            self._changed |= {effect.arc: None for effect in self._core.tell_reasons() if isinstance(effect, Queued)}
+            self._changed |= {effect.arc: None for effect in self._core.report_reasons() if isinstance(effect, Queued)}
             undecided = [arc for arc in self._changed if self.may_be_held(now, arc)]
             changed = [arc for arc in self._changed if arc not in undecided and self._core.is_queued(arc)]
             self._changed = dict.fromkeys(changed)

@@ -1,4 +1,4 @@
-"""Bookings: all of some RCs at once, from a date. `calendar.py` keeps them."""
+"""Bookings: several RCs at once, from a date on. `calendar.py` keeps them."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class Booking(Struct, frozen=True):
     """All of `needs` at once, for `runtime` ns from `start`. Its owner's request takes it up, or it lapses `patience`
     ns after the date.
 
-    Maintenance names RCs, patterns of which it has all RCs that match, and hosts (`keyexpr.of_host`).
+    The needs of maintenance are RCs, hosts (`keyexpr.of_host`), and patterns, each for all matching RCs.
 
     Raises ValueError as `needs.check_request` does."""
 
@@ -40,7 +40,7 @@ class Booking(Struct, frozen=True):
     urgent: bool = False
     """Maintenance also preempts holds within their minimum runtimes, whatever their priority."""
     lasting: bool = False
-    """Maintenance whose end is put off until it is given up."""
+    """Maintenance without a fixed end: it is extended until it is given up."""
 
     broken: bool = False
     """Maintenance that ends no hold and keeps no operator away."""
@@ -59,7 +59,7 @@ class Booking(Struct, frozen=True):
         return {host for host in map(host_in, self.needs) if host is not None} if self.maintenance else set()
 
     def maintains(self, rc: RcName, host: HostName) -> bool:
-        """Return True if maintenance has this RC, offered by this host."""
+        """Return True if this maintenance covers the RC, offered by this host."""
         return any(
             need == rc or (matcher(need)(rc) if is_pattern(need) else host_in(need) == host != "")
             for need in self.needs
@@ -88,10 +88,10 @@ class BookingState(StrEnum):
 
 
 class Dates(Struct, frozen=True):
-    """All that is booked, best-ranked first: of what can't all be kept the first stands, and the others are in
-    conflict. What is missing is unbooked; at present only, if it is `forgotten`. `more`: these are a part, and nothing
-    is judged before all are sent. `moved`: the step in ns of all dates since the last of these events, which the dates
-    of ARCs follow whose bookings are missing."""
+    """All bookings, best-ranked first: of bookings that exclude each other the first is kept, and the others are in
+    conflict. A missing booking is unbooked or, if it is `forgotten`, absent for now. `more`: this is a part, and dates
+    are judged after the last part only. `moved`: the step in ns by which all dates moved since the last of these
+    events; it also moves the dates of ARCs without their bookings."""
 
     ranked: tuple[Booking, ...]
     forgotten: frozenset[str] = frozenset()
@@ -100,8 +100,7 @@ class Dates(Struct, frozen=True):
 
 
 class Booked(Struct, frozen=True):
-    """A booking made by this RCM or an earlier one. `tentative`: conflicts are unknown; its ARC waits until it is
-    certain."""
+    """A booking made by this RCM or an earlier one. `tentative`: conflicts are not known yet, so its ARC waits."""
 
     booking: Booking
     tentative: bool = False
@@ -109,7 +108,7 @@ class Booked(Struct, frozen=True):
 
 class Unbooked(Struct, frozen=True):
     """A booking is given up and its ARC continues without it; or it is impossible `at_present`, and its ARC waits
-    for the date and gets it if it is booked again."""
+    for the date, and takes it up if it is booked again."""
 
     booking: str
     at_present: bool = False
@@ -141,15 +140,15 @@ class BookingBound(Struct, frozen=True):
 
 
 class BookingConflict(Struct, frozen=True):
-    """A booking can't be kept because of another one, or (empty) as no RC for its patterns is free; None: it stands
-    again."""
+    """A booking can't be kept: booking `by` excludes it or, if `by` is empty, no RC for its patterns is free. None: it
+    is kept again."""
 
     booking: str
     by: str | None
 
 
 class BookingStatus(Struct, frozen=True):
-    """An active booking, its ARC, and the RCs bound to its patterns; of maintenance all its RCs."""
+    """An active booking, its ARC, and the RCs bound to its patterns. `maintained`: all RCs of maintenance."""
 
     booking: Booking
     arc: ArcId | None

@@ -1,14 +1,14 @@
 """Bookings in the core: a claim with a date, until its owner's request takes it up.
 
-`Dates` brings all that is booked, best-ranked first. Of two dates that can't both be kept, after two halves of a fleet
-have booked separately, the better-ranked stands; the other is bound to other RCs, or is in conflict and no claim.
+`Dates` has all bookings, best-ranked first. After two halves of a fleet have booked separately, two dates may exclude
+each other. Then the better-ranked one is kept; the other is bound to other RCs, or is in conflict and not a claim.
 
 `reservations.py` keeps their RCs free, `slots.py` finds times, `dangers.py` finds threats. Maintenance is a claim
 that is never taken up.
 
-A change is followed up where it matters: at the claims that overlap it in time and have one of its RCs. An instant does
-a bounded part of this, and asks for the next one. So does a sharable RC: it is asked about few sets at a time, those of
-the next dates first, and a vote that is not known yet causes neither conflict nor danger."""
+After a change, only claims that overlap it in time and share an RC with it are checked again. An instant makes a
+bounded number of checks, and requests another pass for the rest. A sharable RC is asked about few sets at a time, those
+of the next dates first; an unknown vote causes neither conflict nor danger."""
 
 from __future__ import annotations
 
@@ -42,12 +42,12 @@ from zscout.scheduling.state import Actions, SchedulerState
 from zscout.scheduling.votes import HolderSet
 from zscout.types import NO_TERM, ArcId, Ns, Place, RcName
 
-WORK: Final = 256
-"""Checks of one claim in one instant: some 5 ms."""
-SEARCH: Final = 8
-"""Of these for a search of other RCs, or a proposal."""
-IN_FLIGHT: Final = 8
-"""Sets of holders that one RC is asked about at a time."""
+MAX_CHECKS: Final = 256
+"""Checks of claims in one instant: some 5 ms."""
+CHECKS_PER_SEARCH: Final = 8
+"""A search for other RCs, or a proposal, counts as this many checks."""
+MAX_IN_FLIGHT: Final = 8
+"""Sets of holders that an RC is asked about at a time."""
 
 
 def request_for(booking: Booking) -> ArcRequest:
@@ -66,15 +66,15 @@ def request_for(booking: Booking) -> ArcRequest:
 
 @dataclass(slots=True)
 class _Questions:
-    """The sets that one RC is to be asked about, those of the next dates first."""
+    """The sets to ask one RC about, next dates first."""
 
     heap: list[tuple[Ns, int, HolderSet]] = field(default_factory=list)
     waiting: set[HolderSet] = field(default_factory=set)
-    asked: dict[HolderSet, Ns] = field(default_factory=dict)
+    in_flight: dict[HolderSet, Ns] = field(default_factory=dict)
     count: int = 0
 
     def add(self, date: Ns, holders: HolderSet) -> None:
-        if holders not in self.waiting and holders not in self.asked:
+        if holders not in self.waiting and holders not in self.in_flight:
             self.count += 1
             self.waiting.add(holders)
             heapq.heappush(self.heap, (date, self.count, holders))
@@ -87,25 +87,26 @@ class Calendar:
     def __init__(self, state: SchedulerState, actions: Actions, emit: Callable[[Effect], None]) -> None:
         self._state, self._actions, self._emit = state, actions, emit
         self._ranks: dict[str, int] = {}  # of all dates; bookings without a rank are not judged
-        self._lost: dict[str, Claim] = {}  # dates in conflict; their votes are kept, to ask nothing again
-        self._lost_to: dict[str, str] = {}
-        self._lost_at: dict[int, DateIndex] = {}  # by bit of each RC that would do
+        self._in_conflict: dict[str, Claim] = {}  # dates in conflict; their votes are kept, and not asked for again
+        self._conflict_with: dict[str, str] = {}  # by date in conflict: the booking that excludes it
+        self._conflicts_at: dict[int, DateIndex] = {}  # dates in conflict, by bit of each RC that could serve them
         self._unjudged: set[str] = set()
-        self._order: list[tuple[int, str]] = []  # a heap of these, by rank
+        self._order: list[tuple[int, str]] = []  # a heap of the unjudged dates, by rank
         self._unbound: dict[str, None] = {}  # dates whose patterns wait for votes
         self.is_partial = False  # further dates follow
         self._questions: dict[RcName, _Questions] = {}
-        self._askable: dict[RcName, None] = {}  # RCs that may be asked more
-        self._concerned: dict[Claim, None] = {}  # bookings that may be newly in danger, or no longer
-        self._left = WORK
-        self._turn = 0  # counts checks of overdue bookings, which take turns
+        self._askable: dict[RcName, None] = {}  # RCs that may be asked about further sets
+        self._danger_unchecked: dict[Claim, None] = {}  # bookings that may have come into danger or out of it
+        self._checks_left = MAX_CHECKS  # checks left in this instant
+        self._overdue_turn = 0  # counts checks of overdue bookings, which take turns
         self._reserved: Reservations | None = None  # the reservations at the last search for dangers
         self._endangered: dict[Claim, None] = {}  # bookings last reported as endangered
         self._wanting: dict[str, list[Arc]] = {}  # by booking: ARCs that want it while it is absent or taken
         self.certain_from: Ns = 0  # dates before this are uncertain: no booking begins or expires for good
 
     def stand_in(self, booking: Booking) -> Arc:
-        """An ARC that represents a booking until it is taken up. That of maintenance has no RCs: its claim has them."""
+        """Return an ARC that represents a booking until it is taken up. For maintenance it has no RCs: the claim has
+        them."""
         if booking.maintenance:
             return Arc(request_for(booking), Place(NO_TERM, 0), 0)
         arc = self._state.new_arc(request_for(booking), Place(NO_TERM, 0))
@@ -125,19 +126,19 @@ class Calendar:
         state, wanted = self._state, {booking.id: booking for booking in dates.ranked}
         for name in [name for name in state.claims if name not in wanted]:
             self.unbook(name, at_present=name in dates.forgotten)
-        for name in [name for name in self._lost if name not in wanted]:
-            self._forget_votes(self._recall(name))
+        for name in [name for name in self._in_conflict if name not in wanted]:
+            self._forget_votes(self._take_from_conflict(name))
         before, self._ranks = self._ranks, {name: rank for rank, name in enumerate(wanted)}
         known = [name for name in wanted if name in before]
         same_order = all(before[name] < before[other] for name, other in pairwise(known))
         unjudged, self._unjudged, self._order = self._unjudged if same_order else {*known}, set(), []
-        self._look_again(unjudged)
-        known_claims = (state.claims.get(name) or self._lost.get(name) for name in known)
+        self._judge_again(unjudged)
+        known_claims = (state.claims.get(name) or self._in_conflict.get(name) for name in known)
         moves = {wanted[claim.booking.id].start - claim.date for claim in known_claims if claim is not None}
         for name, booking in wanted.items():
-            if (claim := state.claims.get(name) or self._lost.get(name)) is None:
+            if (claim := state.claims.get(name) or self._in_conflict.get(name)) is None:
                 self.book(booking, tentative=name in self._wanting)
-                self._look_again((name,))
+                self._judge_again((name,))
             elif claim.date != booking.start:
                 self.redate(name, booking.start, alike=len(moves) == 1)
 
@@ -158,7 +159,8 @@ class Calendar:
         self._offer(claim)
 
     def _kept(self, claim: Claim) -> int:
-        """Bits of the RCs of a claim that is not held: for maintenance of patterns and hosts those known now."""
+        """Bits of the RCs to keep for a claim that is not held. Maintenance of patterns and hosts has the RCs known
+        now."""
         booking, state = claim.booking, self._state
         if not booking.maintenance:
             return claim.arc.mask
@@ -166,57 +168,57 @@ class Calendar:
         return named | union(rc.bit for rc in state.rcs.values() if booking.maintains(rc.name, rc.host))
 
     def _free_from_patterns(self, claim: Claim, mask: int) -> None:
-        """Rebind the patterns of bookings that have some of these RCs during maintenance."""
+        """Rebind the patterns of bookings that use some of these RCs during this maintenance."""
         dates, booking = self._state.dates, claim.booking
         overlapping = (dates.of(rc, booking.start, booking.end) for rc in self._state.rcs_in(mask))
-        self._keep_others(mask, chain.from_iterable(overlapping))
+        self._rebind_others(mask, chain.from_iterable(overlapping))
 
     def _extend_maintenance(self, rc: Rc) -> None:
-        """Maintenance of patterns and hosts has an RC that came, and no longer one that left its host for another."""
+        """Add a joined RC to the maintenance that covers it, and remove it from its former host's."""
         for claim in list(self._state.maintenance.values()):
             kept = claim.kept | rc.bit if claim.booking.maintains(rc.name, rc.host) else claim.kept & ~rc.bit
             if kept != claim.kept:
                 claim.kept = kept
                 self._state.dates.put(claim)
                 self._free_from_patterns(claim, kept & rc.bit)
-                self._look_again((claim.booking.id,))
+                self._judge_again((claim.booking.id,))
 
     def unbook(self, booking: str, *, at_present: bool) -> None:
         if (claim := self._state.claims.get(booking)) is not None:
             self._end(claim, BookingState.UNBOOKED, at_present=at_present)
 
     def redate(self, booking: str, start: Ns, *, alike: bool = False) -> None:
-        """Move a booking's date. The booking of a hold stays as it is, and is judged by that date. Nothing is judged
-        where all dates move `alike`."""
+        """Move a booking's date. While it is held only the date changes, not its `booking`. No date is judged again if
+        all move `alike`."""
         if not alike:
-            self._look_again((booking,))
-        if (lost := self._lost.get(booking)) is not None:
-            by = self._lost_to[booking]
-            self._recall(booking)
-            lost.booking, lost.date = replace(lost.booking, start=start), start
-            self._lose(lost, by)
+            self._judge_again((booking,))
+        if (conflicting := self._in_conflict.get(booking)) is not None:
+            by = self._conflict_with[booking]
+            self._take_from_conflict(booking)
+            conflicting.booking, conflicting.date = replace(conflicting.booking, start=start), start
+            self._put_in_conflict(conflicting, by)
         if (claim := self._state.claims.get(booking)) is None:
             return
         claim.date = start
         if claim.arc.hold is None:
             claim.booking = replace(claim.booking, start=start)
         self._state.dates.put(claim, changed=not alike)
-        self._concerned[claim] = None
+        self._danger_unchecked[claim] = None
         if claim.arc.hold is None and claim.arc.held_back is not None:
             self._wait_again(claim.arc, start)
         if claim.arc.hold is None:
             self.expire()
 
     def _move_waiting(self, by: Ns) -> None:
-        """Follow a step of the clock with the dates of ARCs whose bookings are absent or taken."""
+        """After a step of the clock, move the dates of ARCs whose bookings are absent or taken."""
         for arc in chain.from_iterable(self._wanting.values()):
             arc.take(replace(arc.request, not_before=arc.request.not_before + by))
             if arc.hold is None:
                 self._wait_again(arc, arc.request.not_before)
 
     def take_up(self, booking: str, arc: Arc) -> None:
-        """Let a waiting or running ARC take its booking up, now or once that is there and open. The ARC waits for
-        the date."""
+        """Let a waiting or running ARC take up its booking: now, or once the booking exists and is open. A waiting ARC
+        is held back until the date."""
         claim = self._state.claims.get(booking)
         if not booking or (claim is not None and (claim.booking.maintenance or claim is arc.claim)):
             return
@@ -235,12 +237,12 @@ class Calendar:
         self._wait_again(arc, claim.booking.start)
 
     def _offer(self, claim: Claim) -> None:
-        """Offer an open booking to the ARCs that want it, if they are its owner's: not checked before."""
+        """Let the ARCs that want an open booking take it up, if they match it and are its owner's."""
         booking = claim.booking
         for arc in [] if claim.tentative else self._wanting.pop(booking.id, ()):
-            asked = arc.request
-            same = asked.needs == booking.needs and asked.priority == booking.priority
-            if same and asked.client.partition("/")[0] == booking.owner:
+            request = arc.request
+            same = request.needs == booking.needs and request.priority == booking.priority
+            if same and request.client.partition("/")[0] == booking.owner:
                 self.take_up(booking.id, arc)
 
     def _wait_until(self, arc: Arc, date: Ns) -> None:
@@ -258,7 +260,7 @@ class Calendar:
             self._state.consider_again(arc)
 
     def give_up(self, arc: Arc, outcome: Outcome, *, had_it: bool) -> None:
-        """End the booking of an ended ARC; reopen it if the program is gone or gave up before it held."""
+        """End the booking of an ended ARC. Before it lapses, reopen it if the client was lost or the ARC never held."""
         claim = arc.claim
         again = outcome is Outcome.CLIENT_LOST or not had_it
         if claim is not None and not (again and self._state.now < claim.booking.lapses):
@@ -271,9 +273,9 @@ class Calendar:
         name, claim = arc.request.booking, arc.claim
         if wanting := [waiting for waiting in self._wanting.pop(name, ()) if waiting is not arc]:
             self._wanting[name] = wanting
-        if (lost := self._lost.get(name)) is not None and lost.arc is arc:
-            lost.arc = self.stand_in(lost.booking)
-            self._look_again((name,))
+        if (conflicting := self._in_conflict.get(name)) is not None and conflicting.arc is arc:
+            conflicting.arc = self.stand_in(conflicting.booking)
+            self._judge_again((name,))
         if claim is not None:
             arc.claim = None
             if claim.booking.start != claim.date:
@@ -313,8 +315,8 @@ class Calendar:
                 self._end(claim, BookingState.LAPSED)
 
     def in_maintenance(self) -> Iterator[tuple[Claim, Rc, Arc]]:
-        """Holders that maintenance ends: of equal or lower priority, past their minimum runtimes; all, if it is urgent.
-        The caller may end them meanwhile."""
+        """Yield the holders that maintenance ends: of equal or lower priority past their minimum runtimes; all, if it
+        is urgent. The caller may end them meanwhile."""
         now = self._state.now
         for claim in self._state.maintenance.values() if self._state.maintenance else ():
             begun = claim.booking.start <= now and not claim.booking.broken
@@ -325,26 +327,26 @@ class Calendar:
                         yield claim, rc, holder
 
     def rc_lost(self, rc: Rc) -> None:
-        self._keep_others(rc.bit, self._state.dates.of(rc, self._state.now))
+        self._rebind_others(rc.bit, self._state.dates.of(rc, self._state.now))
 
     def rc_joined(self, rc: Rc) -> None:
         self._extend_maintenance(rc)
-        self._look_again(claim.booking.id for claim in self._state.dates.of(rc, self._state.now))
-        self._look_again(self._lost)
-        self._look_again(self._unbound)
+        self._judge_again(claim.booking.id for claim in self._state.dates.of(rc, self._state.now))
+        self._judge_again(self._in_conflict)
+        self._judge_again(self._unbound)
 
-    def _keep_others(self, mask: int, claims: Iterable[Claim]) -> None:
-        """Rebind the patterns of bookings that have some of these RCs, the next dates first, where other RCs are free
-        then. Dangers do so later for those that are too many for one instant."""
+    def _rebind_others(self, mask: int, claims: Iterable[Claim]) -> None:
+        """Rebind the patterns of bookings that use some of these RCs to other RCs that are free then, the next dates
+        first. Bookings beyond this instant's checks are rebound when their danger is found."""
         for claim in by_date(claim for claim in {*claims} if claim.kept & mask & ~claim.arc.named_mask):
-            if self._left > 0:
-                self._keep_another(claim)
+            if self._checks_left > 0:
+                self._rebind(claim)
 
-    def _keep_another(self, claim: Claim) -> bool:
+    def _rebind(self, claim: Claim) -> bool:
         arc, booking, now = claim.arc, claim.booking, self._state.now
         if not arc.patterns or arc.hold is not None:
             return False
-        self._left -= SEARCH
+        self._checks_left -= CHECKS_PER_SEARCH
         date = max(booking.start, now)
         found = slots(self._state, replace(booking, start=date), arc, date, 1, presume=True).found
         kept = arc.named_mask | self._state.mask(found[0].bound.values()) if found else claim.kept
@@ -360,17 +362,17 @@ class Calendar:
     # Changes, followed up in parts
 
     def begin(self) -> None:
-        """An instant begins."""
-        self._left = WORK
+        """Begin an instant, with all its checks left."""
+        self._checks_left = MAX_CHECKS
 
     def follow_up(self) -> None:
         """Judge dates, ask votes and report dangers where something has changed."""
         state = self._state
-        if not state.claims and not self._lost:
+        if not state.claims and not self._in_conflict:
             if self._reserved is not None or state.dates.touched:
                 self._reserved = None
                 state.dates.touched.clear()
-                for of_claims in (self._endangered, self._concerned, self._questions, self._askable):
+                for of_claims in (self._endangered, self._danger_unchecked, self._questions, self._askable):
                     of_claims.clear()
                 self._unjudged.clear()
                 self._order.clear()
@@ -378,42 +380,44 @@ class Calendar:
             state.votes.changed.clear()
             return
         self._take_votes()
-        self._spread()
+        self._mark_affected()
         self._judge()
-        self._ask()
+        self._ask_votes()
         self._take_changes()
-        self._spread()
+        self._mark_affected()
         self._report_dangers()
-        if self._unjudged or self._concerned or self._askable:
+        if self._unjudged or self._danger_unchecked or self._askable:
             self._actions.run_again()
 
-    def _spread(self) -> None:
-        """Look again at what overlaps changed claims."""
+    def _mark_affected(self) -> None:
+        """Mark claims and dates that overlap changed claims for another check."""
         state, touched = self._state, self._state.dates.touched
-        if self._reserved is None and not self._lost and len(self._unjudged) >= len(self._ranks):
-            touched.clear()  # all are looked at
+        if self._reserved is None and not self._in_conflict and len(self._unjudged) >= len(self._ranks):
+            touched.clear()  # all are checked anyway
         while touched:
             claim, mask, start, end = touched.popitem()[0]
             rank = self._ranks.get(claim.booking.id, math.inf)
             if claim.booking.id in state.claims:
-                self._concerned[claim] = None
+                self._danger_unchecked[claim] = None
             for bit in bits(mask):
                 for other in state.dates.of(state.rc_of(bit), start, end):
-                    self._concerned[other] = None
+                    self._danger_unchecked[other] = None
                     if self._ranks.get(other.booking.id, -1) > rank:
-                        self._look_again((other.booking.id,))
-                if bit in self._lost_at:
-                    self._look_again(lost.booking.id for lost in self._lost_at[bit].overlapping(start, end))
+                        self._judge_again((other.booking.id,))
+                if bit in self._conflicts_at:
+                    self._judge_again(
+                        conflicting.booking.id for conflicting in self._conflicts_at[bit].overlapping(start, end)
+                    )
 
-    def _look_again(self, names: Iterable[str]) -> None:
-        """Judge these dates."""
+    def _judge_again(self, names: Iterable[str]) -> None:
+        """Put these dates in the order to be judged."""
         for name in names:
             if name not in self._unjudged and (rank := self._ranks.get(name)) is not None:
                 self._unjudged.add(name)
                 heapq.heappush(self._order, (rank, name))
 
     def _take_votes(self) -> None:
-        """Look again at what new and dropped votes are about."""
+        """Mark claims and dates that new and dropped votes are about for another check."""
         state = self._state
         changed, state.votes.changed = state.votes.changed, {}
         for name, sets in changed.items():
@@ -422,45 +426,45 @@ class Calendar:
                 self._askable[name] = None
             if sets is None:
                 claims = state.dates.of(rc, state.now)
-                self._concerned |= dict.fromkeys(claims)
-                self._look_again(claim.booking.id for claim in claims)
+                self._danger_unchecked |= dict.fromkeys(claims)
+                self._judge_again(claim.booking.id for claim in claims)
             for holders in sets or ():
                 vetoed = not state.votes.accepts(name, holders)
                 for holder in holders:
                     claim = self._claim_of(holder)
                     if claim is not None:
-                        self._concerned[claim] = None
-                        self._look_again((claim.booking.id,))
+                        self._danger_unchecked[claim] = None
+                        self._judge_again((claim.booking.id,))
                     elif vetoed and (arc := state.running.get(holder)) is not None:
-                        self._concerned |= dict.fromkeys(state.dates.of(rc, state.now, arc.known_end()))
+                        self._danger_unchecked |= dict.fromkeys(state.dates.of(rc, state.now, arc.known_end()))
                     if vetoed and claim is not None:
                         spans = state.dates.of(rc, claim.booking.start, claim.booking.end)
-                        self._concerned |= dict.fromkeys(spans)
+                        self._danger_unchecked |= dict.fromkeys(spans)
 
     def _claim_of(self, holder: ArcId) -> Claim | None:
-        """The claim of an ARC, or of a booking that none has taken up."""
+        """The claim of an ARC, or of a booking that no ARC has taken up."""
         arc = self._state.arc(holder)
-        if arc is not None and (arc.claim is not None or arc.request.booking in self._lost):
-            return arc.claim or self._lost[arc.request.booking]
-        return self._state.claims.get(holder) or self._lost.get(holder)
+        if arc is not None and (arc.claim is not None or arc.request.booking in self._in_conflict):
+            return arc.claim or self._in_conflict[arc.request.booking]
+        return self._state.claims.get(holder) or self._in_conflict.get(holder)
 
-    def stranger(self, holder: ArcId) -> Arc | None:
-        """What stands in votes for a date in conflict."""
-        return self._lost[holder].arc if holder in self._lost else None
+    def placeholder_in_conflict(self, holder: ArcId) -> Arc | None:
+        """The ARC that represents a date in conflict in votes."""
+        return self._in_conflict[holder].arc if holder in self._in_conflict else None
 
-    # Which dates stand
+    # Which dates are kept
 
     def _judge(self) -> None:
-        """Find which dates stand, best-ranked first: a date counts against all that rank below it."""
-        while self._order and self._left > 0:
+        """Decide which dates are kept, best-ranked first: a date may be in the way of lower-ranked dates only."""
+        while self._order and self._checks_left > 0:
             name = heapq.heappop(self._order)[1]
             self._unjudged.discard(name)
-            self._left -= 1
+            self._checks_left -= 1
             if (claim := self._state.claims.get(name)) is not None:
                 self._judge_claim(claim)
-            elif name in self._lost:
-                self._judge_lost(name)
-            self._spread()
+            elif name in self._in_conflict:
+                self._judge_conflict(name)
+            self._mark_affected()
 
     def _judge_claim(self, claim: Claim) -> None:
         if claim.arc.patterns and not claim.booking.bound and claim.arc.hold is None:
@@ -468,8 +472,8 @@ class Calendar:
             return
         by, unknown = self._obstacle(claim)
         if by is None:
-            self._want(claim, unknown)
-            self._concerned[claim] = None
+            self._want_votes(claim, unknown)
+            self._danger_unchecked[claim] = None
             if claim.tentative:
                 claim.tentative = False
                 self._offer(claim)
@@ -477,82 +481,82 @@ class Calendar:
         self._end(claim, BookingState.UNBOOKED, at_present=True, forget=False)
         self._bind(claim, by)
 
-    def _judge_lost(self, name: str) -> None:
-        claim = self._lost[name]
+    def _judge_conflict(self, name: str) -> None:
+        claim = self._in_conflict[name]
         by, _ = self._obstacle(claim)
-        if by is None and not (claim.arc.patterns and not self._lost_to[name]):
-            self._recall(name)
+        if by is None and not (claim.arc.patterns and not self._conflict_with[name]):
+            self._take_from_conflict(name)
             self._emit(BookingConflict(name, None))
             self._enter(claim)
         else:
             self._bind(claim, by or "")
 
     def _enter(self, claim: Claim) -> None:
-        """A date stands again."""
+        """Make a date in conflict a claim again."""
         claim.booking = replace(claim.booking, start=claim.date)
         claim.arc = self.stand_in(claim.booking)
         claim.kept, claim.tentative = self._kept(claim), False
         self._state.dates.add(claim)
-        self._look_again((claim.booking.id,))
+        self._judge_again((claim.booking.id,))
         self._offer(claim)
 
     def _bind(self, claim: Claim, by: str) -> None:
-        """Bind the patterns of a date to RCs that are free then; if there are none, `by` is in its way."""
-        name, stands = claim.booking.id, claim.booking.id in self._state.claims
+        """Bind the patterns of a date to RCs that are free then. If there are none, it is in conflict with `by`."""
+        name, is_claim = claim.booking.id, claim.booking.id in self._state.claims
         self._unbound.pop(name, None)
         if claim.arc.patterns:
-            self._left -= SEARCH
+            self._checks_left -= CHECKS_PER_SEARCH
             unbound = replace(claim.booking, start=claim.date, bound={})
             found = slots(self._state, unbound, self.stand_in(unbound), claim.date, 1, bookings_only=True)
             if found.unknown:
-                self._want(claim, found.unknown)
-                if not by and stands:
+                self._want_votes(claim, found.unknown)
+                if not by and is_claim:
                     self._unbound[name] = None
-                    return  # judged again when they are in
+                    return  # judged again when the votes are in
             elif found.found:
                 bound = found.found[0].bound
                 claim.booking = replace(unbound, bound=bound)
-                if stands:
+                if is_claim:
                     self._state.bind(claim.arc, bound)
                     claim.kept = claim.arc.mask
                     self._state.dates.put(claim)
                     self._offer(claim)
                 else:
-                    if name in self._lost:
-                        self._recall(name)
+                    if name in self._in_conflict:
+                        self._take_from_conflict(name)
                         self._emit(BookingConflict(name, None))
                     self._enter(claim)
                 self._emit(BookingBound(name, bound))
                 return
-        if stands:
+        if is_claim:
             self._end(claim, BookingState.UNBOOKED, at_present=True, forget=False)
-        if self._lost_to.get(name) != by:
-            if name in self._lost:
-                self._recall(name)
-            self._lose(claim, by)
+        if self._conflict_with.get(name) != by:
+            if name in self._in_conflict:
+                self._take_from_conflict(name)
+            self._put_in_conflict(claim, by)
             self._emit(BookingConflict(name, by))
 
-    def _lose(self, claim: Claim, by: str) -> None:
+    def _put_in_conflict(self, claim: Claim, by: str) -> None:
         name = claim.booking.id
-        self._lost[name], self._lost_to[name] = claim, by
+        self._in_conflict[name], self._conflict_with[name] = claim, by
         for bit in bits(self._choices(claim)):
-            self._lost_at.setdefault(bit, DateIndex()).add(claim.date, claim.date + claim.booking.runtime, claim)
+            self._conflicts_at.setdefault(bit, DateIndex()).add(claim.date, claim.date + claim.booking.runtime, claim)
 
-    def _recall(self, name: str) -> Claim:
-        claim = self._lost.pop(name)
-        del self._lost_to[name]
-        for bit in list(self._lost_at):
-            self._lost_at[bit].discard(claim.date, claim.date + claim.booking.runtime, claim)
-            if not self._lost_at[bit]:
-                del self._lost_at[bit]
+    def _take_from_conflict(self, name: str) -> Claim:
+        claim = self._in_conflict.pop(name)
+        del self._conflict_with[name]
+        for bit in list(self._conflicts_at):
+            self._conflicts_at[bit].discard(claim.date, claim.date + claim.booking.runtime, claim)
+            if not self._conflicts_at[bit]:
+                del self._conflicts_at[bit]
         return claim
 
     def _choices(self, claim: Claim) -> int:
         return claim.kept | union(map(self._state.matching_mask, claim.arc.patterns))
 
     def _obstacle(self, claim: Claim) -> tuple[str | None, list[tuple[Rc, HolderSet]]]:
-        """A better-ranked date in the way of this one, if any, and the votes that would tell. Absent RCs are not
-        judged: whether they are sharable is unknown."""
+        """A better-ranked date that excludes `claim`, if any; else the unknown votes that decide. Absent RCs are
+        skipped, as it is unknown whether they are sharable."""
         state, unknown, rank = self._state, list[tuple[Rc, HolderSet]](), self._ranks[claim.booking.id]
         # A running ARC keeps the RCs of its patterns.
         needed = claim.kept if claim.arc.hold is None else claim.arc.named_mask
@@ -562,15 +566,18 @@ class Calendar:
                 for other in state.dates.of(rc, claim.date, claim.date + claim.booking.runtime)
                 if (other_rank := self._ranks.get(other.booking.id, rank)) < rank
                 and other.mask & rc.bit
-                and _meet(claim, other)
+                and _overlap(claim, other)
             ]
             before = [other for _, other in sorted(found, key=itemgetter(0))]
-            if before and (not rc.sharable or _excluded(claim, before) or self._refused(rc, claim, before, unknown)):
+            if before and (
+                not rc.sharable or _any_maintenance(claim, before) or self._refused(rc, claim, before, unknown)
+            ):
                 return before[0].booking.id, []
         return None, unknown
 
     def _refused(self, rc: Rc, claim: Claim, before: list[Claim], unknown: list[tuple[Rc, HolderSet]]) -> bool:
-        """Return True if the RC would refuse it beside the others, at any time of it."""
+        """Return True if the RC refuses the claim beside those `before` it, at any time of the claim. Adds the unknown
+        votes on this."""
         for time in sorted({claim.booking.start, *(other.booking.start for other in before)}):
             if not claim.booking.start <= time < claim.booking.end:
                 continue
@@ -585,46 +592,46 @@ class Calendar:
 
     # Votes
 
-    def _want(self, claim: Claim, unknown: Iterable[tuple[Rc, HolderSet]]) -> None:
+    def _want_votes(self, claim: Claim, unknown: Iterable[tuple[Rc, HolderSet]]) -> None:
         for rc, holders in unknown:
             self._questions.setdefault(rc.name, _Questions()).add(claim.booking.start, holders)
             self._askable[rc.name] = None
 
     @property
     def next_question(self) -> Ns | None:
-        """When an RC that does not answer may be asked again."""
+        """When an unresponsive RC may be asked again."""
         votes = self._state.votes
         silent = self._questions.keys() & votes.unresponsive if votes.unresponsive else ()
         return min(map(votes.retry_at, silent), default=None)
 
-    def _ask(self) -> None:
-        """Ask each RC about a few sets at a time, those of the next dates first."""
+    def _ask_votes(self) -> None:
+        """Ask each RC about a few sets at a time, next dates first."""
         votes = self._state.votes
         for name in votes.due(self._state.now) if votes.unresponsive else ():
             if name in self._questions:
                 self._askable[name] = None
         for name in list(self._askable):
-            if self._left <= 0:
+            if self._checks_left <= 0:
                 return
             del self._askable[name]
             questions = self._questions[name]
             self._ask_rc(self._state.rc(name), questions)
-            if not questions.heap and not questions.asked:
+            if not questions.heap and not questions.in_flight:
                 del self._questions[name]
 
     def _ask_rc(self, rc: Rc, questions: _Questions) -> None:
-        votes, asked = self._state.votes, questions.asked
-        for holders, date in list(asked.items()):
+        votes, in_flight = self._state.votes, questions.in_flight
+        for holders, date in list(in_flight.items()):
             if not votes.is_asked(rc.name, holders):
-                del asked[holders]
+                del in_flight[holders]
                 questions.add(date, holders)
-        while questions.heap and votes.open(rc.name) < IN_FLIGHT:
+        while questions.heap and votes.open(rc.name) < MAX_IN_FLIGHT:
             date, _, holders = questions.heap[0]
             if self._may_ask(rc, holders):
-                self._left -= SEARCH
+                self._checks_left -= CHECKS_PER_SEARCH
                 if not self._actions.propose(rc, holders) and rc.name in votes.unresponsive:
                     return
-                asked[holders] = date
+                in_flight[holders] = date
             questions.pop()
 
     def _may_ask(self, rc: Rc, holders: HolderSet) -> bool:
@@ -634,8 +641,7 @@ class Calendar:
     # Dangers
 
     def _take_changes(self) -> None:
-        """Look again at the bookings that changed holders, RCs and reservations may affect, those in danger and overdue
-        ones."""
+        """Mark for a check the bookings whose danger may have changed with holders, RCs or reservations."""
         state, before = self._state, self._reserved
         self._reserved = reserved = reservations(state, before)
         changed, state.changed = state.changed, {}
@@ -643,30 +649,30 @@ class Calendar:
             for bit, over in reserved.starving_changed(before).items():
                 changed[bit] = max(over, changed.get(bit, 0))
         if before is None:
-            self._concerned |= dict.fromkeys(state.claims.values())
+            self._danger_unchecked |= dict.fromkeys(state.claims.values())
         for bit, until in changed.items() if before is not None else ():
             if until > state.now and bit & state.dates.claimed:
-                self._concerned |= dict.fromkeys(state.dates.of(state.rc_of(bit), state.now, until))
+                self._danger_unchecked |= dict.fromkeys(state.dates.of(state.rc_of(bit), state.now, until))
         mask = union(changed)
-        self._concerned |= {claim: None for claim in self._endangered if mask and self._choices(claim) & mask}
+        self._danger_unchecked |= {claim: None for claim in self._endangered if mask and self._choices(claim) & mask}
 
     def _report_dangers(self) -> None:
-        """Report bookings newly in danger, or no longer."""
-        state, concerned, uncertain = self._state, self._concerned, self._unjudged | self._unbound.keys()
-        while concerned and self._left > 0:
-            claim = next(iter(concerned))
-            del concerned[claim]
+        """Report bookings that came into danger or out of it, and other causes of danger."""
+        state, unchecked, uncertain = self._state, self._danger_unchecked, self._unjudged | self._unbound.keys()
+        while unchecked and self._checks_left > 0:
+            claim = next(iter(unchecked))
+            del unchecked[claim]
             name = claim.booking.id
             if state.claims.get(name) is claim and name not in uncertain:
-                self._left -= 1
+                self._checks_left -= 1
                 self._report_danger(claim)
         # The reasons of overdue bookings change with their ARCs.
         begun = state.dates.begun(state.now)
         waiting = [claim for claim in begun if claim.arc.hold is None and claim.booking.id not in uncertain]
-        for _ in range(min(len(waiting), self._left)):
-            self._turn += 1
-            self._left -= 1
-            self._report_danger(waiting[self._turn % len(waiting)])
+        for _ in range(min(len(waiting), self._checks_left)):
+            self._overdue_turn += 1
+            self._checks_left -= 1
+            self._report_danger(waiting[self._overdue_turn % len(waiting)])
 
     @property
     def next_start(self) -> Ns | None:
@@ -676,7 +682,7 @@ class Calendar:
     def _report_danger(self, claim: Claim) -> None:
         state, reserved = self._state, reservations(self._state, self._reserved)
         found = danger(state, reserved, claim)
-        if isinstance(found, Reason) and self._keep_another(claim):
+        if isinstance(found, Reason) and self._rebind(claim):
             reserved = reservations(state, reserved)
             found = danger(state, reserved, claim)
         self._reserved = reserved
@@ -694,11 +700,11 @@ class Calendar:
         self._emit(BookingThreatened(claim.booking.id, found))
 
 
-def _meet(claim: Claim, other: Claim) -> bool:
-    """Return True if both are at one time; maintenance does not conflict with maintenance."""
+def _overlap(claim: Claim, other: Claim) -> bool:
+    """Return True if the claims overlap in time; maintenance does not conflict with maintenance."""
     both = claim.booking.maintenance and other.booking.maintenance
     return not both and -other.booking.runtime < other.date - claim.date < claim.booking.runtime
 
 
-def _excluded(claim: Claim, before: list[Claim]) -> bool:
+def _any_maintenance(claim: Claim, before: list[Claim]) -> bool:
     return claim.booking.maintenance or any(other.booking.maintenance for other in before)

@@ -1,4 +1,4 @@
-"""Active bookings by id, date and RC: those of a span of time are found without a look at all others."""
+"""Active bookings by id, date and RC: finds the bookings of a time span without a scan of all."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from zscout.types import Ns
 
 
 class DateIndex:
-    """Claims by time. Those of similar length are sorted by start together, so that a long one slows no search."""
+    """Claims by time. Claims of similar length share a list sorted by start, so a long claim slows no search."""
 
     def __init__(self) -> None:
         self._levels: dict[int, list[tuple[Ns, str, Claim]]] = {}  # by the bits of the length
@@ -38,7 +38,7 @@ class DateIndex:
             self.remove(start, end, claim)
 
     def overlapping(self, start: Ns, end: float) -> list[Claim]:
-        """The claims that may overlap this span: at most twice as far away as they are long."""
+        """The claims that may overlap this span: some begin up to twice their length before it."""
         found: list[Claim] = []
         for level, entries in self._levels.items():
             first, last = bisect_left(entries, (start - (1 << level),)), bisect_left(entries, (end,))
@@ -48,7 +48,7 @@ class DateIndex:
 
 
 class ClaimIndex:
-    """Every change of a booking, its ARC or its RCs comes through `add`, `put` or `remove`."""
+    """Call `add`, `put` or `remove` at every change of a booking, its ARC or its RCs."""
 
     def __init__(self) -> None:
         self.by_id: dict[str, Claim] = {}
@@ -65,7 +65,7 @@ class ClaimIndex:
         self._spans: dict[Claim, tuple[int, Ns, Ns]] = {}  # as indexed
         self._touched_at: dict[int, int] = {}  # by bit: the version at the last change
         self._seen: tuple[int, int, int] | None = None
-        self._suspended: set[Claim] = set()  # begun, while some of their RCs are absent
+        self._suspended: set[Claim] = set()  # past their dates while an RC is absent: nothing is kept for them
 
     def add(self, claim: Claim) -> None:
         booking = claim.booking
@@ -75,7 +75,7 @@ class ClaimIndex:
         self._enter(claim)
 
     def put(self, claim: Claim, *, changed: bool = True) -> None:
-        """Index an active claim again after it has changed, or moved as all have."""
+        """Index an active claim again after a change. Not `changed`: it moved by the same step as all others."""
         self._leave(claim, changed=changed)
         self._enter(claim, changed=changed)
 
@@ -119,11 +119,11 @@ class ClaimIndex:
             self._touched_at[bit] = self.version
 
     def changed_since(self, version: int) -> int:
-        """Bits of the RCs with other bookings than in this version."""
+        """Bits of the RCs whose bookings have changed since this version."""
         return 0 if version == self.version else union(bit for bit, at in self._touched_at.items() if at > version)
 
     def pass_time(self, now: Ns, present: int) -> None:
-        """After its date a booking is kept only while all its RCs are present."""
+        """Suspend the bookings past their dates of which an RC is absent, and resume the others."""
         begun = bisect_right(self._by_date, (now, "\U0010ffff"))
         if (seen := (begun, present if begun else 0, self.version)) == self._seen:
             return
@@ -137,12 +137,12 @@ class ClaimIndex:
         return [self.by_id[name] for _, name in self._by_date[: bisect_right(self._by_date, (now, "\U0010ffff"))]]
 
     def of(self, rc: Rc, start: Ns, end: float = math.inf) -> list[Claim]:
-        """The claims that may have or keep `rc` at some time between."""
+        """The claims that may hold or keep `rc` at some time of this span."""
         timeline = self._by_rc.get(rc.bit)
         return [] if timeline is None else timeline.overlapping(start, end)
 
     def booked(self, rc: Rc, start: Ns, end: float) -> list[Claim]:
-        """The claims that have `rc` then: held or kept, and not suspended."""
+        """The claims that hold or keep `rc` at some time of this span, and are not suspended."""
         return [
             claim
             for claim in self.of(rc, start, end)
@@ -156,7 +156,7 @@ class ClaimIndex:
         return claim in self._suspended
 
     def over(self, now: Ns) -> Iterator[Claim]:
-        """Bookings whose time or patience is over; each may come twice."""
+        """Yield the bookings whose time or patience is over, each perhaps twice."""
         while self._ends and self._ends[0][0] <= now:
             at, booking = heapq.heappop(self._ends)
             claim = self.by_id.get(booking)

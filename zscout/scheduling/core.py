@@ -1,13 +1,13 @@
-"""The core of the RCM: events in, effects out, time given; no clock, thread, socket or log inside.
+"""The core of the RCM: events and the time in, effects out; no clock, thread, socket or log inside.
 
 This module applies events and carries out decisions. The strategy's pass (`priority.py` has its steps) decides which
 ARC starts and which is preempted, by the rule of `Arc.preemptible_by`; `votes.py` keeps the votes of RCs, `state.py`
-holds and queue. The RCM service, `zscout replay`, the study and the forecast use this class:
+the holds and the queue. The RCM service, `zscout replay`, the study and the forecast use this class:
 
     effects = core.handle(now, Requested(request), ...)
 
-A batch of events is one instant. The caller carries the effects out in order and returns with their results: votes,
-and a `Tick` at the latest when `WakeAt` asks for it."""
+A batch of events is one instant. The caller carries out the effects in order and calls again with their results: with
+votes, and with a `Tick` at the time of the last `WakeAt`, if nothing comes before."""
 
 from __future__ import annotations
 
@@ -37,10 +37,10 @@ NO_HOSTS: Final = frozenset[HostName]()
 
 class Core:
     def __init__(
-        self, strategy: Strategy | None = None, policy: SchedulingPolicy = DEFAULT, *, foretells: bool = False
+        self, strategy: Strategy | None = None, policy: SchedulingPolicy = DEFAULT, *, assume_latest_begin: bool = False
     ) -> None:
-        """`foretells`: RCs report nothing, so each is taken to begin as late as its bound allows."""
-        self.strategy, self._foretells = strategy or Priority(), foretells
+        """`assume_latest_begin`: RCs report nothing, so each is assumed to begin as late as its bound allows."""
+        self.strategy, self._assume_latest_begin = strategy or Priority(), assume_latest_begin
         self._state = SchedulerState(policy, adaptive=self.strategy.name == "adaptive")
         self._votes = self._state.votes
         self.term: Term = NO_TERM
@@ -49,14 +49,14 @@ class Core:
         self._arrivals = 0
         self._effects: list[model.Effect] = []
         self._calendar = Calendar(self._state, self, lambda effect: self._effects.append(effect))
-        self._over: set[Grant] = set()  # grants of earlier terms that ended in this term
+        self._ended_grants: set[Grant] = set()  # grants of earlier terms that ended in this term
         self._wake: Ns | None = None
         self._run_again = False
 
     def handle(self, now: Ns, *events: model.Event) -> list[model.Effect]:
-        """Apply one instant's events and run a pass. Raises ValueError where `now` goes backwards.
+        """Apply one instant's events and run a pass. Raises ValueError if `now` goes backwards.
 
-        1. End the holds whose time is over.
+        1. End the holds and bookings whose time is over.
         2. Apply the events, in the order given.
         3. End the kept holds that block maintenance.
         4. Run a pass of the strategy, if the queue is not empty.
@@ -72,7 +72,7 @@ class Core:
         self._calendar.expire()
         self._state.readmit()
         if len(events) == 1 and isinstance(events[0], model.Requested):
-            self._ask(events[0], alone=True)
+            self._enter_request(events[0], alone=True)
         else:
             for event in events:
                 self._apply(event)
@@ -93,15 +93,15 @@ class Core:
         """Return True if a waiting ARC may have another reason than the one last reported."""
         return bool(self._state.index.unreported)
 
-    def tell_reasons(self) -> list[model.Effect]:
-        """The reasons that changed since the last report, for callers that display them."""
+    def report_reasons(self) -> list[model.Effect]:
+        """Return the reasons that changed since the last report, for callers that display them."""
         self._effects = []
         for arc, reason in reasons_of_now(self._state):
             self.wait(arc, reason)
         return self._effects
 
     def upcoming_changed(self, *, reported: bool) -> bool:
-        """Return True if a hold may have other upcoming ends than those last reported. `reported`: one had any."""
+        """Return True if upcoming ends of holds may have changed since the last report. `reported`: it had some."""
         state = self._state
         contended = (state.index.contended | state.dates.contended) & (state.busy | state.sharable)
         return bool(contended and (reported or state.queued or state.claims))
@@ -111,7 +111,6 @@ class Core:
         return [arc.id for arc in contended_holds(self._state)]
 
     def upcoming(self, arc_id: ArcId) -> tuple[UpcomingEnd, ...]:
-        """The upcoming ends of a hold."""
         arc = self._state.running.get(arc_id)
         return () if arc is None else upcoming(self._state, arc)
 
@@ -157,7 +156,7 @@ class Core:
         return [self._arc_status(arc) for arc in self._state.rc(rc).holders.values()]
 
     def arcs_of(self, client: ClientId) -> list[ArcId]:
-        """The ARCs of one client, waiting first, so that none profits from the end of the others."""
+        """The ARCs of one client, waiting first: ended in this order, none can start by the end of another."""
         arcs = self._state.arcs_of(client)
         return [arc.id for arc in sorted(arcs, key=lambda arc: (arc.hold is not None, arc.entry))]
 
@@ -190,14 +189,14 @@ class Core:
         return others if first is None else [first.id, *others]
 
     def could_have_issued(self, place: Place) -> bool:
-        """Return True if this core may have given out `place`, or the term is another."""
+        """Return True unless `place` is of this term and has not been given out yet."""
         return place.term != self.term or place.arrival <= self._arrivals
 
     def as_events(
         self, term: Term, limit: int | None = None, *, without: Container[str] = ()
     ) -> tuple[list[model.Event], model.LeadTaken]:
-        """The events that bring another core to this state, in a term of its own, with the best-ranked `limit` of the
-        queue (None: all), and `without` these bookings."""
+        """The events that bring another core to this state, in `term`: with the best-ranked `limit` of the queue (None:
+        all), and `without` these bookings."""
         state = self._state
         joined: list[model.Event] = [
             model.RcJoined(rc.name, rc.sharable, rc.host, rc.begin_within, rc.unwell)
@@ -224,19 +223,21 @@ class Core:
         joined += [Booked(claim.booking) for name, claim in state.claims.items() if name not in without]
         queued = (*state.queued.values(), *state.held_back.values()) if limit is None else self._best_ranked(limit)
         waiting = tuple(
-            model.Requested(arc.request, arc.place, arc.since, model.WaitSoFar(arc.patience, arc.lost, arc.told))
+            model.Requested(
+                arc.request, arc.place, arc.since, model.WaitSoFar(arc.patience, arc.lost, arc.unproven_wait)
+            )
             for arc in queued
         )
         return joined, model.LeadTaken(term, recovered_holds, waiting, self.charged(), patience=self.patience)
 
     def slots(self, wanted: Booking, until: Ns, limit: int, *, bookings_only: bool = False) -> SlotsFound:
-        """The first `limit` times between the start of `wanted`, which is no maintenance, and `until` at which it would
-        be kept. `bookings_only` ignores holds and queue."""
+        """The first `limit` times, from the start of `wanted` to `until`, at which this booking could be kept; not for
+        maintenance. `bookings_only` ignores holds and queue."""
         arc = self._calendar.stand_in(wanted)
         return slots(self._state, wanted, arc, until, limit, bookings_only=bookings_only)
 
     def likely_slot(self, wanted: Booking, until: Ns, runtimes: RuntimeEstimator) -> Ns | None:
-        """An estimate of its start if holds end when they usually do; nothing is kept for it."""
+        """An estimate of its start if holds end when they usually do. It reserves nothing."""
         now, running = self._state.now, self._state.running.values()
         ends = {arc.id: runtimes.end(arc.request, arc.hold, now) for arc in running if arc.hold is not None}
         likely = {arc: end for arc, end in ends.items() if end is not None}
@@ -244,13 +245,16 @@ class Core:
         return found[0].start if found else None
 
     def ask_votes(self, unknown: Iterable[tuple[Rc, HolderSet]], wanted: Booking | None = None) -> list[model.Propose]:
-        """Proposals for unknown votes on bookings; `wanted` is not made yet."""
-        stranger = None if wanted is None else self._calendar.stand_in(wanted)
+        """Proposals for unknown votes on bookings; `wanted`: a booking not made yet."""
+        newcomer = None if wanted is None else self._calendar.stand_in(wanted)
         proposals = []
         for rc, holders in unknown:
             if (number := self._votes.propose(rc.name, holders, self._state.now)) is not None:
-                known = [self._state.voter(holder) or self._calendar.stranger(holder) for holder in sorted(holders)]
-                arcs = [arc or stranger for arc in known]
+                known = [
+                    self._state.voter(holder) or self._calendar.placeholder_in_conflict(holder)
+                    for holder in sorted(holders)
+                ]
+                arcs = [arc or newcomer for arc in known]
                 params = {arc.id: self._state.params(arc, rc) for arc in arcs if arc is not None}
                 proposals.append(model.Propose(number, rc.name, params))
         return proposals
@@ -274,7 +278,7 @@ class Core:
 
     @property
     def patience(self) -> Ns:
-        """Of an ARC that is queued now; 0 where none is ever due."""
+        """The patience of an ARC that is queued now; 0 where none is ever due."""
         return self._state.patience if self._state.adaptive else 0
 
     def charged_in_all(self) -> dict[str, float]:
@@ -298,7 +302,7 @@ class Core:
     def _apply(self, event: model.Event) -> None:
         match event:
             case model.Requested():
-                self._ask(event)
+                self._enter_request(event)
             case model.Cancelled(arc, by):
                 self._end_request(arc, Outcome.CANCELLED, Reason(ReasonCode.CANCELLED, detail=by))
             case model.Released(arc, by):
@@ -324,7 +328,7 @@ class Core:
                 if rules_changed:
                     self._votes.forget_rc(rc)
             case model.RcBegins():
-                self._begin(event)
+                self._note_begins(event)
             case model.RcLost(rc, reason, why):
                 self._lose_rc(rc, why or reason)
                 self._state.rc(rc).absence = why
@@ -334,7 +338,7 @@ class Core:
             case model.PlaceShown(arc, place):
                 self._show_place(arc, place)
             case model.Unconfirmed(arc, grant, rcs):
-                self._not_confirmed(arc, grant, rcs)
+                self._end_unconfirmed(arc, grant, rcs)
             case model.Reachable(arc):
                 if (held_back := self._state.held_back.get(arc)) is not None:
                     self._state.consider_again(held_back)
@@ -357,22 +361,22 @@ class Core:
             case model.Tick():
                 pass
 
-    def _ask(self, asked: model.Requested, *, alone: bool = False) -> None:
+    def _enter_request(self, requested: model.Requested, *, alone: bool = False) -> None:
         """`alone`: the only event of this instant."""
-        if self._state.arc(asked.request.arc) is not None:
+        if self._state.arc(requested.request.arc) is not None:
             return
-        arc = self._new_arc(asked.request, asked.place)
-        if alone and asked.since is None and not asked.request.booking and self._state.is_free(arc):
-            # As any strategy would, without a queue of one.
+        arc = self._new_arc(requested.request, requested.place)
+        if alone and requested.since is None and not requested.request.booking and self._state.is_free(arc):
+            # Any strategy would start it; this saves queueing it first.
             self._state.enter(arc)
             self.start(arc)
             return
-        since = self._state.now if asked.since is None else min(asked.since, self._state.now)
-        arc.told = self._state.now - since
-        if asked.past is not None:
-            arc.patience, arc.lost, arc.told = asked.past
+        since = self._state.now if requested.since is None else min(requested.since, self._state.now)
+        arc.unproven_wait = self._state.now - since
+        if requested.past is not None:
+            arc.patience, arc.lost, arc.unproven_wait = requested.past
         self._state.enqueue(arc, since)
-        self._calendar.take_up(asked.request.booking, arc)
+        self._calendar.take_up(requested.request.booking, arc)
 
     def _new_arc(self, request: model.ArcRequest, place: Place | None) -> Arc:
         if place is None:
@@ -396,7 +400,7 @@ class Core:
         self._calendar.give_up(arc, outcome, had_it=False)
 
     def _lose_rc(self, name: str, reason: str) -> None:
-        """End each gang of a lost RC as a whole and queue it at its place."""
+        """End each hold of a lost RC at all its RCs, and queue the ARC at its place."""
         rc = self._state.rc(name)
         for arc in list(rc.holders.values()):
             self._end_hold(arc, Outcome.LOST, Reason(ReasonCode.RC_LOST, (name,), detail=reason))
@@ -416,8 +420,8 @@ class Core:
             if held_back is not None:
                 self._state.hold_back(arc, *held_back)
 
-    def _not_confirmed(self, arc_id: ArcId, grant: Grant, rcs: tuple[RcName, ...]) -> None:
-        """End exactly this hold. Its ARC keeps its place and is held back, longer each time in a row."""
+    def _end_unconfirmed(self, arc_id: ArcId, grant: Grant, rcs: tuple[RcName, ...]) -> None:
+        """End the hold with this grant. Its ARC keeps its place and is held back, longer each time in a row."""
         arc = self._state.running.get(arc_id)
         if arc is None or arc.hold is None or arc.hold.grant != grant:
             return
@@ -466,59 +470,59 @@ class Core:
         self._calendar.certain_from = lead.dates_from
         if lead.patience:
             self._state.runtimes.restore(lead.patience)
-        # The newest grant is the truth where two claim one exclusive RC.
+        # Where two holds claim one exclusive RC, the newest grant counts.
         for held in sorted(lead.recovered_holds, key=lambda held: held.grant, reverse=True):
             if self._state.arc(held.request.arc) is None:
-                self._take_up(held)
+                self._recover_hold(held)
         self._expire()
-        for asked in lead.waiting:
-            self._ask(asked)
+        for requested in lead.waiting:
+            self._enter_request(requested)
 
     def _adopt(self, held: model.RecoveredHold) -> None:
         known = self._state.arc(held.request.arc)
         # A grant of this term that is unknown here has ended.
-        over = held.grant in self._over or held.grant.term == self.term
+        over = held.grant in self._ended_grants or held.grant.term == self.term
         if over or (known is not None and known.hold is not None):
             return
         if known is not None:
             self._remove(known)
             held = replace(held, place=min(known.place, held.place or known.place))
-        arc = self._take_up(held)
+        arc = self._recover_hold(held)
         if known is not None and arc.hold is None and self._state.arc(arc.id) is arc:
-            # Use its client's request: the report lacks parameters of absent RCs.
+            # Queue its client's own request: the RCs' report lacks parameters of absent RCs.
             self._remove(arc)
-            arc = self._queue_anew(known.request, held.place, vouched=known.vouched)
+            arc = self._queue_again(known.request, held.place, vouched=known.vouched)
         if arc.hold is not None and (arc.request.keep or not arc.past_min_runtime(self._state.now)):
             self._effects.append(self._granted(arc, arc.hold))
         self._expire()
 
-    def _vouch(self, told: model.Vouched) -> None:
+    def _vouch(self, vouched: model.Vouched) -> None:
         """Replace a request reported by RCs with its client's own, and re-enter its hold."""
-        arc = self._state.arc(told.request.arc)
-        if arc is not None and arc.hold is not None and not arc.vouched and told.bound is None:
+        arc = self._state.arc(vouched.request.arc)
+        if arc is not None and arc.hold is not None and not arc.vouched and vouched.bound is None:
             self._end_hold(arc, Outcome.LOST, of_rcs(ReasonCode.SUPERSEDED, sorted(arc.needs)[:1]))
-            arc = self._state.arc(told.request.arc)
+            arc = self._state.arc(vouched.request.arc)
         if arc is None or arc.vouched:
             return
-        place, hold = told.place or arc.place, arc.hold
-        if hold is None or told.bound is None:
+        place, hold = vouched.place or arc.place, arc.hold
+        if hold is None or vouched.bound is None:
             self._remove(arc)
-            self._queue_anew(told.request, place)
+            self._queue_again(vouched.request, place)
             return
         held = model.RecoveredHold(
-            told.request,
+            vouched.request,
             place,
             hold.grant,
             hold.start,
             hold.end,
-            told.bound,
+            vouched.bound,
             protected_from=hold.protected_from,
             waits={**arc.waits},
             runtime=hold.runtime,
         )
         self._state.stop(arc)
         self._forget(arc)
-        arc = self._take_up(held)
+        arc = self._recover_hold(held)
         if arc.hold is not None:
             self._effects.append(self._granted(arc, arc.hold))
 
@@ -528,16 +532,16 @@ class Core:
         self._forget(arc)
         self._calendar.leave(arc)
 
-    def _queue_anew(self, request: model.ArcRequest, place: Place | None, *, vouched: bool = True) -> Arc:
+    def _queue_again(self, request: model.ArcRequest, place: Place | None, *, vouched: bool = True) -> Arc:
         arc = self._new_arc(request, place)
         arc.vouched = vouched
         self._state.enqueue(arc, self._state.now)
         self._calendar.take_up(request.booking, arc)
         return arc
 
-    def _take_up(self, held: model.RecoveredHold) -> Arc:
-        """Continue a hold of an earlier term if all its RCs are present and free, and no other ARC runs at its
-        place; else end it and queue its ARC."""
+    def _recover_hold(self, held: model.RecoveredHold) -> Arc:
+        """Continue a hold of an earlier term if all its RCs are present and free and no other ARC runs at its place.
+        Otherwise end it, and queue its ARC unless its time is over."""
         arc = self._new_arc(held.request, held.place)
         arc.vouched = held.vouched
         if arc.patterns:
@@ -546,7 +550,7 @@ class Core:
         arc.waits = {**held.waits}
         if (waits := max(filter(None, held.waits.values()), default=None)) is not None:
             hold = replace(hold, waits=waits, last=self._state.last(arc, waits, held.end))
-            arc.lost = 0  # what it lost before is not known, as the leader before knew when it was granted
+            arc.lost = 0  # earlier losses are unknown: only the previous leader knew the time of the grant
         absent = [rc.name for rc in self._state.rcs_in(arc.mask & ~self._state.present)]
         taken = [rc.name for rc in self._state.rcs_in(arc.mask & self._state.busy)]
         other = self._state.at_place(arc.place)
@@ -572,7 +576,7 @@ class Core:
     def _expire(self) -> None:
         for arc in self._state.expired_arcs():
             if not arc.runs:
-                continue  # its devices have not begun: its end is set once they have
+                continue  # its devices have not begun; its end is set once they have
             if arc.hold is not None and arc.hold.last is not None and arc.hold.last <= self._state.now:
                 self._end_hold(arc, Outcome.COMPLETED, Reason(ReasonCode.LIMIT), requeue=False)
             elif arc.request.keep:
@@ -590,7 +594,7 @@ class Core:
     def start(self, arc: Arc) -> None:
         grant = Grant(self.term, self.number())
         now, state = self._state.now, self._state
-        runtime, begun = self._protected_runtime(arc), now + arc.begin_within if self._foretells else now
+        runtime, begun = self._protected_runtime(arc), now + arc.begin_within if self._assume_latest_begin else now
         hold = state.hold(arc, grant, now, arc.ends_after(now, begun, runtime), runtime=runtime)
         if not arc.preemptions:
             state.runtimes.count(arc.owner, arc.request.min_runtime)
@@ -599,27 +603,27 @@ class Core:
         self._effects.append(self._granted(arc, hold, waited))
 
     def _protected_runtime(self, arc: Arc) -> Ns | None:
-        """The minimum runtime of a hold that starts now; None: its request's."""
+        """The minimum runtime of a hold that starts now (`ArcRequest.until_done`); None: its request's."""
         request, begun = arc.request, self._state.now + arc.begin_within
         if request.until_done <= request.min_runtime or not request.keep or arc.claim is not None:
             return None
         free = Reservations(self._state).free_until(arc, begun + request.until_done) - begun
         return free if free > request.min_runtime else None
 
-    def _begin(self, reported: model.RcBegins) -> None:
-        """Count the runtimes of the holds of an RC from when the last RC of each has begun."""
+    def _note_begins(self, reported: model.RcBegins) -> None:
+        """Note when the RC begins its holds: the runtime of a hold counts from the begin of its last RC."""
         self._state.set_begin_within(reported.rc, reported.begin_within)
         for arc in list(self._state.rc(reported.rc).holders.values()):
             if arc.hold is None or arc.hold.grant not in reported.holds:
                 continue
             until, waits = reported.holds[arc.hold.grant], reported.rc in arc.waits
             if (waits and arc.waits[reported.rc] is None) or (until is None and not waits):
-                continue  # it has begun, and does so once
+                continue  # a begin is counted once
             arc.waits[reported.rc] = until
-            self._time(arc, arc.hold)
+            self._retime_hold(arc, arc.hold)
 
-    def _time(self, arc: Arc, hold: Hold) -> None:
-        """Set the end of a hold by when its RCs begin."""
+    def _retime_hold(self, arc: Arc, hold: Hold) -> None:
+        """Set the end of a hold by the time at which its RCs begin."""
         now, waits = self._state.now, arc.waits_until
         if waits == hold.waits or (waits is not None and abs(waits - (hold.waits or 0)) < model.WAITS_SLACK):
             return
@@ -639,7 +643,7 @@ class Core:
         return arc.id in self._state.queued
 
     def wait(self, arc: Arc, reason: Reason, *, settled: bool = True) -> None:
-        # Keep the earlier reason while proposals are open, to avoid flapping.
+        # While proposals are open the earlier reason stays, to avoid flapping.
         if reason == arc.reason or (not settled and arc.reason):
             return
         for why in (arc.reason, reason):
@@ -657,8 +661,8 @@ class Core:
         self._run_again = True
 
     def _end_hold(self, arc: Arc, outcome: Outcome, reason: Reason, *, requeue: bool = True) -> None:
-        """End a hold. An ARC past its minimum runtime is not queued again, nor one that names what its owner
-        may not hold any more."""
+        """End a hold. Its ARC is not queued again if it is past its minimum runtime, or names an RC that its owner may
+        not hold now."""
         requeue = requeue and not arc.past_min_runtime(self._state.now) and not self._state.is_barred(arc)
         hold = self._state.stop(arc)
         self._effects.append(self._revocation(arc, hold, outcome, reason, requeued=requeue))
@@ -666,8 +670,8 @@ class Core:
         if requeue:
             preempted = outcome is Outcome.PREEMPTED
             arc.preemptions += preempted
-            arc.told = arc.told if preempted else 0
-            # Waiting counts through preemption.
+            arc.unproven_wait = arc.unproven_wait if preempted else 0
+            # With `adaptive`, the wait before a preempted hold still counts.
             self._state.enqueue(arc, self._state.now - (arc.waited if preempted and self._state.adaptive else 0))
         else:
             self._forget(arc)
@@ -691,20 +695,20 @@ class Core:
     def _revocation(self, arc: Arc, hold: Hold, outcome: Outcome, reason: Reason, *, requeued: bool) -> model.HoldEnded:
         self.number()
         if hold.grant.term != self.term:
-            self._over.add(hold.grant)
+            self._ended_grants.add(hold.grant)
         rcs = tuple(sorted(arc.needs))
         by = reason.by[0].arc if reason.by and reason.code is not ReasonCode.MAINTENANCE else None
         return model.HoldEnded(arc.id, arc.request.client, hold.grant, rcs, outcome, reason, requeued, by)
 
     def next_change(self) -> Ns | None:
-        """When the passing of time next changes something; before, only events do, and the order of fair shares."""
+        """When time alone next changes something, apart from the order of fair shares; before, only events do."""
         calendar, held_back = self._calendar, self._state.held_back.values()
         dates = (self._state.next_end(), self._state.dates.next_change(), calendar.next_start, calendar.next_question)
         ends = [end for end in (*dates, self._state.next_starving()) if end is not None]
         return min(ends + [arc.held_back[0] for arc in held_back if arc.held_back], default=None)
 
     def next_order(self) -> Ns | None:
-        """When the groups that wait are next put in order (`fair_shares.py`)."""
+        """When the waiting groups are next put in order (`fair_shares.py`)."""
         shares = self._state.shares
         return None if shares is None or not self._state.queued else shares.next_order()
 

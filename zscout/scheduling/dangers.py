@@ -1,8 +1,8 @@
 """Threats to a booking's start at its date, found early enough to act on.
 
-Checks the RCs kept for it: presence, holders that neither end nor yield by then, earlier promises, and votes. An
-unknown vote neither causes nor ends a danger; a queued ARC without a promise causes none. After the date, the danger
-is its ARC's reason to wait."""
+The RCs kept for it are checked for presence, for holders that neither end nor yield by the date, for earlier promises,
+and for votes. An unknown vote neither causes nor ends a danger; a queued ARC without a promise causes none. After the
+date, the danger is the reason why its ARC waits."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ _PASSING: Final = (ReasonCode.VOTING, ReasonCode.SEARCHING, ReasonCode.NOT_YET)
 
 
 class Undecided(NamedTuple):
-    """A vote decides: the vote on `proposal`, or one in progress."""
+    """A vote decides: the vote on `proposal` or, without `rc`, one in progress."""
 
     rc: Rc | None = None
     proposal: HolderSet = frozenset()
 
 
 def danger(state: SchedulerState, reserved: Reservations, claim: Claim) -> Reason | Undecided | None:
-    """The reason why a booking would miss its date, or can't start now; None: nothing in its way."""
+    """The reason why a booking would miss its date or can't start now; None: there is none."""
     booking, arc = claim.booking, claim.arc
     if booking.maintenance or arc.hold is not None:
         return None
@@ -66,8 +66,8 @@ def danger(state: SchedulerState, reserved: Reservations, claim: Claim) -> Reaso
 
 def _why_it_waits(state: SchedulerState, claim: Claim) -> Reason | Undecided | None:
     arc, votes = claim.arc, state.votes
-    asked = (rc for rc, holders in votes.proposals.values() if arc.id in holders)
-    if arc.state is ArcState.DEFERRED or any(rc not in votes.unresponsive for rc in asked):
+    proposed = (rc for rc, holders in votes.proposals.values() if arc.id in holders)
+    if arc.state is ArcState.DEFERRED or any(rc not in votes.unresponsive for rc in proposed):
         return Undecided()
     return arc.reason if arc.reason is not None and arc.reason.code not in _PASSING else None
 

@@ -61,7 +61,7 @@ def forecast(
     """Play a copy of `core` forward from `now`, with `newcomer` asking at once. With `runtimes` holds end when they
     usually do."""
     # A copy, as a strategy may keep unfinished searches.
-    copy = Core(STRATEGIES[core.strategy.name](), core.policy, foretells=True)
+    copy = Core(STRATEGIES[core.strategy.name](), core.policy, assume_latest_begin=True)
     booked = {booking.id: (booking, arc is None) for booking, arc in core.bookings()}
     own = "" if newcomer is None else newcomer.booking
     later = {name: booking for name, (booking, is_open) in booked.items() if is_open and name != own}

@@ -1,4 +1,4 @@
-"""Data of the scheduling core: requests, RCs, events, effects in the order to carry them out, and status.
+"""Data of the scheduling core: requests, RCs, events, effects and status.
 
 Times are whole ns on the caller's clock. Bandwidth parameters are `Fraction`, so sums are exact."""
 
@@ -36,20 +36,20 @@ from zscout.types import SECOND, ArcId, ClientId, Grant, Need, Ns, Params, Place
 QUANTUM: Ns = SECOND
 """The paper's quantum: while an ARC waits, a pass runs at least this often."""
 HOLD_BACK: Final[Ns] = SECOND
-"""Pause of an ARC after an unconfirmed hold: doubled each time in a row,"""
+"""Pause of an ARC after an unconfirmed hold. Each further one in a row doubles it."""
 MAX_HOLD_BACK: Final[Ns] = 30 * SECOND
-"""up to this."""
+"""The longest such pause."""
 
 WAITS_SLACK: Final[Ns] = SECOND
-"""A smaller change of when devices begin at the latest is not reported."""
+"""Smaller changes of the time by which devices begin are not reported."""
 
 Rank: TypeAlias = tuple[int, int, Ns, Place, ArcId]
 """Sort key, best first: priority (negated), position of the group (`fair_shares.py`), minimum runtime, place, id."""
 
 
 class ArcRequest(Struct, frozen=True):
-    """All of `needs` at once, for at least `min_runtime` ns (> 0). A need names an RC, or is a pattern that any one RC
-    meets.
+    """A request for all of `needs` at once, for at least `min_runtime` ns (> 0). A need is the name of an RC, or a
+    pattern that any matching RC meets.
 
     Raises ValueError as `needs.check_request` does."""
 
@@ -64,20 +64,20 @@ class ArcRequest(Struct, frozen=True):
     direct: bool = False
     """Its program accesses devices without their RCs; unused by the core."""
     continues: str = ""
-    """The name of the ARC of the same client that it continues, on the same RCs where possible."""
+    """The name of its client's ARC that it continues, on the same RCs where possible."""
     booking: str = ""
     not_before: Ns = 0
     """The date to wait for while its booking is absent or impossible."""
     who: Who | None = None
     """The requester, for people; unused by the core."""
     charged_to: str = ""
-    """The name whose quotas count, if not its client's host: that of a component's starter."""
+    """The owner for quotas and fair shares, if not its client's host: for a component, the person who started it."""
     until_done: Ns = 0
     """A kept hold is protected this long, if that is more than `min_runtime`, but not beyond the next reserved time of
     its RCs (`Core.start`). Rank, patience and reservations go by `min_runtime`."""
 
     def at_most(self, longest: Ns) -> ArcRequest:
-        """The request with runtimes of at most `longest` ns."""
+        """Return the request with its runtimes cut to `longest` ns."""
         if max(self.min_runtime, self.until_done) <= longest:
             return self
         shorter = min(self.min_runtime, longest), min(self.until_done, longest)
@@ -99,8 +99,8 @@ class ArcRequest(Struct, frozen=True):
 
 
 class Hold(Struct, frozen=True):
-    """A grant in force. `end`: end of the minimum runtime, the latest possible while it `waits`; with `keep` the hold
-    outlasts it."""
+    """A grant in force. `end` is the end of the minimum runtime, or the latest possible end until the devices have
+    begun; with `keep` the hold lasts longer."""
 
     grant: Grant
     start: Ns
@@ -108,18 +108,19 @@ class Hold(Struct, frozen=True):
     protected_below: int | None = None
     """From `protected_from` to `end` only this priority or higher preempts it; None: any higher priority."""
     last: Ns | None = None
+    """When `max_runtime` ends it; None: never."""
     protected_from: Ns = 0
     waits: Ns | None = None
-    """While devices of it have not begun: when the last one begins at the latest. Its runtime counts from then."""
+    """The time by which the last of its devices begins, and its runtime with it. None: all have begun."""
     runtime: Ns | None = None
     """The minimum runtime of this hold, if it is longer than its request's (`until_done`)."""
 
     def remaining(self, now: Ns) -> Ns:
-        """What is left of the minimum runtime; all of it while devices have not begun."""
+        """The time left of the minimum runtime: all of it until the devices have begun."""
         return self.end - (now if self.waits is None else max(now, self.waits))
 
     def starting(self, now: Ns) -> Ns | None:
-        """The time until its devices have begun, at most; None: they have."""
+        """The longest time until its devices have begun; None: they have."""
         return None if self.waits is None else max(0, self.waits - now)
 
 
@@ -131,12 +132,13 @@ class ArcState(StrEnum):
     """Checked by the next pass in any case."""
     VOTING = "voting"
     DEFERRED = "deferred"
-    """Stopped by the open votes of a higher rank."""
+    """Waits for the open votes of a higher rank about common RCs."""
     WATCHING = "watching"
     PARKED = "parked"
-    """An RC that does not answer proposals keeps it out."""
+    """Waits for an RC that does not answer proposals."""
     HELD_BACK = "held_back"
-    """Not considered for a while after an unconfirmed hold, or while another ARC has its place."""
+    """Not considered for now: after an unconfirmed hold, before its booking's date, or while another ARC has its
+    place."""
     RUNNING = "running"
     ENDED = "ended"
 
@@ -167,29 +169,30 @@ class Arc:
     """The last reported reason to wait; None while it runs. `Core.arc` has the current reason."""
     since: Ns = 0  # when it was last queued or granted
     preemptions: int = 0
-    entry: int = 0  # grows with each entry into the queue or among the running
+    entry: int = 0  # the number of its last entry into the queue or among the running ARCs
     rcs: tuple[Rc, ...] = ()  # the RCs of `mask` in bit order; set when first queued
     footprint: int | None = None  # while VOTING, DEFERRED or PARKED: bits of the RCs that it would take or free
     masked_obstacles: int = 0
-    """While VOTING or DEFERRED: bits of the RCs whose obstacle was off limits and did not count."""
+    """While VOTING or DEFERRED: bits of the RCs whose obstacles did not count, because they were off limits."""
     watched: Rc | PatternClass | None = None
     like: PatternClass | None = None  # while queued, with patterns
     unconfirmed: int = 0  # unconfirmed holds in a row
     held_back: tuple[Ns, tuple[RcName, ...]] | None = None
-    """While HELD_BACK: until when, and for which RCs; None where another ARC has its place."""
+    """While HELD_BACK: the end of the pause, and the RCs that end it when they join; None where another ARC has its
+    place."""
     starving: bool = False  # waiting for too long (`reservations.py`)
-    patience: Ns = 0  # the fleet's, as it was when the ARC was queued
+    patience: Ns = 0  # the fleet's patience at the time when the ARC was queued
     lost: Ns = 0  # runtime lost to other owners' ARCs
     waited: Ns = 0  # while it runs: how long it waited before
-    told: Ns = 0  # of its wait: what its client tells, which protects from nothing
+    unproven_wait: Ns = 0  # the part of its wait that only its client reports: it gives no protection
     bound: Mapping[Need, RcName] = field(default_factory=dict)
     """The RC of each pattern (`patterns.py`), while it runs or is checked. Empty if some pattern has none."""
     claim: Claim | None = None  # the active booking that it has taken up
     waits: dict[RcName, Ns | None] = field(default_factory=dict)
-    """While it runs: the RCs that could not begin at its grant, with when they begin at the latest; None: one has begun
-    since."""
+    """While it runs: the RCs that could not begin at its grant, each with the time by which it begins; None: it has
+    begun since."""
     position: int = 0  # the position of its group (`fair_shares.py`); while it runs, as of its start
-    vouched: bool = True  # by its client; False: only RCs have reported it, and it is not charged
+    vouched: bool = True  # False: only RCs have reported it, not yet its client, and it is not charged
     late: Ns = 0  # delay that its group's share adds to its waiting time (`reservations.py`)
     owner: str = field(init=False)  # for quotas
     id: ArcId = field(init=False)
@@ -203,7 +206,7 @@ class Arc:
         self.take(self.request)
 
     def take(self, request: ArcRequest) -> None:
-        """Replace its request, by itself or another client's with the same needs."""
+        """Set the request, of this or another client, with the same needs; derive its fields again."""
         self.request, self.id, self.priority = request, request.arc, request.priority
         self.owner = request.owner
         self.party = Party(self.id, request.label or self.id, self.priority, request.who)
@@ -215,12 +218,12 @@ class Arc:
 
     @property
     def starves(self) -> Ns:
-        """When it begins to starve, if it waits (`reservations.py`)."""
+        """When it begins to starve if it is still queued (`reservations.py`)."""
         return self.since + self.late + self.patience // 2
 
     @property
     def begin_within(self) -> Ns:
-        """The greatest bound of its RCs on the time from the grant until they have begun; 0 where one has none."""
+        """The longest `Rc.begin_within` of its RCs; 0 if an RC has none."""
         most: Ns = 0
         for rc in self.rcs:
             if rc.begin_within is None:
@@ -229,25 +232,25 @@ class Arc:
         return most
 
     def ends(self, start: Ns) -> Ns:
-        """The latest end of its minimum runtime, or of its booking, if it is granted then."""
+        """The latest end of its minimum runtime, or the end of its booking, if it is granted at `start`."""
         return self.ends_after(start, start + self.begin_within)
 
     def ends_after(self, start: Ns, begun: Ns, runtime: Ns | None = None) -> Ns:
-        """The end of its minimum runtime, or of its booking, if it is granted at `start` and its devices begin then.
-        `runtime`: that of the hold, if not the request's."""
+        """The end of its minimum runtime, or of its booking, if it is granted at `start` and its devices begin at
+        `begun`. `runtime`: the hold's minimum runtime, if not the request's."""
         end = begun + (self.request.min_runtime if runtime is None else runtime)
         return end if self.claim is None or start >= self.claim.booking.end else self.claim.booking.end
 
     @property
     def waits_until(self) -> Ns | None:
-        """When the last of its RCs begins, at the latest; None: all have begun, or one knows no such bound."""
+        """The time by which the last of its RCs begins; None: all have begun, or an RC knows no bound."""
         if not self.waits or any(rc.begin_within is None for rc in self.rcs):
             return None
         return max((until for until in self.waits.values() if until is not None), default=None)
 
     @property
     def runs(self) -> bool:
-        """Return True if the time of its hold passes: its devices have begun, or the end of its booking stands."""
+        """Return True if its hold's runtime has begun: all devices have, or its booking fixes the end."""
         return self.hold is not None and (self.hold.waits is None or self.claim is not None)
 
     def move_to(self, state: ArcState) -> None:
@@ -256,7 +259,7 @@ class Arc:
         self.state = state
 
     def known_end(self, other: Arc | None = None) -> float:
-        """When its hold ends or `other` may preempt it, as known now; infinite for a kept hold."""
+        """When its hold ends or `other` may preempt it, as known now; infinite for a kept hold without such an end."""
         if self.hold is None:
             return math.inf
         kept = self.request.keep and (other is None or self.priority > other.priority)
@@ -264,7 +267,7 @@ class Arc:
         return last if kept else min(self.hold.end, last)
 
     def blocks(self, other: Arc) -> Party:
-        """Its party in the reason of `other`, with the time until it blocks that."""
+        """Its party in the reason of `other`, with the time until which it is in the way."""
         end = self.known_end(other)
         return self.party._replace(until=None if math.isinf(end) else int(end))
 
@@ -289,11 +292,11 @@ class Arc:
 @dataclass(slots=True, eq=False)
 class Claim:
     booking: Booking
-    arc: Arc  # the ARC that took it up; before, a placeholder in reservations and votes that never waits nor runs
+    arc: Arc  # the ARC that took it up; until then a placeholder for reservations and votes, neither queued nor run
     kept: int  # bits of the RCs kept for it; its ARC may choose others for its patterns
     tentative: bool = False  # conflicts are not checked yet: it can't be taken up
     danger: Reason | None = None  # the last reported danger
-    date: Ns = field(init=False)  # its start by the fleet's clock, which holds do not follow
+    date: Ns = field(init=False)  # its start by the fleet's clock; while it is held, `booking.start` stays as it was
 
     def __post_init__(self) -> None:
         self.date = self.booking.start
@@ -320,7 +323,7 @@ class Rc:
     unwell: str = ""  # why it is granted to operators only, though present
     host: str = ""  # its host, or the last one while absent
     begin_within: Ns | None = 0
-    """The longest time from a grant until it has begun, without what settles. None: an RC that knows no such bound."""
+    """The longest time from a grant until it has begun, settling not included. None: the RC reports no bound."""
     holders: dict[ArcId, Arc] = field(default_factory=dict)
     demand: list[Rank] = field(default_factory=list)  # of the queued ARCs that name it, best first
     watchers: list[Rank] = field(default_factory=list)
@@ -328,7 +331,7 @@ class Rc:
 
     @property
     def wanted(self) -> tuple[float, ...]:
-        """Sort key: the less wanted the smaller, by the best rank that names it, then by number."""
+        """Sort key, least wanted first: by the best rank that names the RC, then by the number of such ARCs."""
         if not self.demand:
             return (-math.inf,)
         priority, position, min_runtime, _, _ = self.demand[0]
@@ -348,7 +351,7 @@ class PatternClass:
     members: list[Rank] = field(default_factory=list)
     watchers: list[Rank] = field(default_factory=list)  # members that wait for any change within `reach`
     turns: list[tuple[Rank, Mapping[Need, RcName]]] = field(default_factory=list)
-    """Bindings to different RCs as far as possible: each from this rank on, to the next."""
+    """Bindings, to different RCs as far as possible. Each serves the ranks from its own up to the next entry's."""
     usable: int = 0  # `patterns.usable` and `short`, as of this version of the state
     usable_of: int = -1
     short: bool = False
@@ -371,16 +374,16 @@ def union(masks: Iterable[int]) -> int:
 
 
 class WaitSoFar(NamedTuple):
-    """Of an ARC that waits: what counts for its protection (`Arc`)."""
+    """Fields of a queued ARC that decide about its protection, as in `Arc`."""
 
     patience: Ns
     lost: Ns
-    told: Ns
+    unproven_wait: Ns
 
 
 class Requested(Struct, frozen=True):
-    """`place` is set for an ARC of an earlier RCM, and `since`, if known, is when it was last queued. `past` is set in
-    a copy of a core: a new RCM forgets it."""
+    """`place` is set for an ARC of an earlier RCM; `since`, if known, is when it was last queued. `past` is set where
+    a core is copied: a new RCM doesn't know it."""
 
     request: ArcRequest
     place: Place | None = None
@@ -389,7 +392,7 @@ class Requested(Struct, frozen=True):
 
 
 class Cancelled(Struct, frozen=True):
-    """`by`: who ended it; empty: its own client."""
+    """`by`: the name of its ender, for the reason; empty: its own client."""
 
     arc: ArcId
     by: str = ""
@@ -420,8 +423,7 @@ class RcJoined(Struct, frozen=True):
 
 
 class RcBegins(Struct, frozen=True):
-    """An RC reports how long it needs to begin. `holds`: by grant, until when its holder waits at the latest; None: the
-    RC has begun."""
+    """An RC reports how long it needs to begin. `holds`: by grant, the time by which the RC begins; None: it has."""
 
     rc: RcName
     begin_within: Ns | None
@@ -429,7 +431,8 @@ class RcBegins(Struct, frozen=True):
 
 
 class RcUnwell(Struct, frozen=True):
-    """A present RC is not well: its holders keep it, and only operators get it. `why` is empty once it is well."""
+    """A present RC is unwell: its holders keep it, and it is granted to operators only. `why` is empty once it is
+    well."""
 
     rc: RcName
     why: str = ""
@@ -444,7 +447,7 @@ class RcReported(Struct, frozen=True):
 
 
 class RcLost(Struct, frozen=True):
-    """An RC is gone or can't carry its holders; `why`, if known, appears in the reasons of waiting ARCs."""
+    """An RC left or can't carry its holders; `why`, if known, appears in the reasons of waiting ARCs."""
 
     rc: RcName
     reason: str = "it left the mesh"
@@ -457,7 +460,7 @@ class ClientLost(Struct, frozen=True):
 
 
 class PlaceShown(Struct, frozen=True):
-    """A client presents the earlier place of an ARC that entered without it."""
+    """A client presents the earlier place of an ARC that was queued without it."""
 
     arc: ArcId
     place: Place
@@ -495,7 +498,7 @@ class RecoveredHold(Struct, frozen=True):
     bound: Mapping[Need, RcName] = {}
     vouched: bool = True
     protected_from: Ns | None = None
-    """As its RCs report it; None: they do not."""
+    """As reported by its RCs; None: they did not."""
     waits: Mapping[RcName, Ns | None] = {}
     """The RCs that have not begun (`Arc.waits`): `end` counts from the last one's bound."""
     runtime: Ns | None = None
@@ -504,7 +507,7 @@ class RecoveredHold(Struct, frozen=True):
     def __post_init__(self) -> None:
         patterns = {need for need in self.request.needs if is_pattern(need)}
         if patterns != self.bound.keys() or not all(matcher(need)(rc) for need, rc in self.bound.items()):
-            raise ValueError(f"what ARC {self.request.arc} holds for its patterns is not told, or told wrong")
+            raise ValueError(f"recovered hold of ARC {self.request.arc}: `bound` must name a matching RC per pattern")
 
     @property
     def rcs(self) -> list[RcName]:
@@ -520,14 +523,14 @@ class LeadTaken(Struct, frozen=True):
     charged: Mapping[str, float] = {}
     """By group: contended RC-seconds, decayed as of now (`fair_shares.py`)."""
     dates_from: Ns = 0
-    """Dates before this are uncertain: their ARCs do not begin."""
+    """Bookings with earlier dates are uncertain: their ARCs do not start."""
     patience: Ns | None = None
-    """The last that a leader published."""
+    """The patience that a leader last published."""
 
 
 class Adopted(Struct, frozen=True):
     """RCs joined with a hold of an earlier term. It continues if its gang is complete, unless this RCM has ended it
-    or its ARC holds something newer."""
+    or its ARC has a newer hold."""
 
     held: RecoveredHold
 
@@ -555,10 +558,10 @@ class Outcome(StrEnum):
     PREEMPTED = "preempted"
     """Queued again with its place."""
     RELEASED = "released"
-    """Ended by its client before the time."""
+    """Ended by its client before its time was over."""
     CANCELLED = "cancelled"
     LOST = "lost"
-    """An RC of the gang went away; queued again with its place."""
+    """An RC of the gang was lost; queued again with its place."""
     CLIENT_LOST = "client_lost"
     HANDED_OVER = "handed_over"
 
@@ -570,7 +573,7 @@ class Propose(Struct, frozen=True):
 
 
 class Granted(Struct, frozen=True):
-    """All of `rcs` belong to the ARC until `end`; None: kept beyond its minimum runtime."""
+    """The ARC holds all of `rcs` until `end`; None: it keeps them after its minimum runtime."""
 
     arc: ArcId
     client: ClientId
@@ -579,11 +582,11 @@ class Granted(Struct, frozen=True):
     start: Ns
     end: Ns | None
     waited: Ns | None = None
-    """ns in the queue before; None for a hold that only continues."""
+    """ns in the queue before; None for a hold that was already running."""
 
 
 class HoldTimed(Struct, frozen=True):
-    """The runtime of a hold begins at `waits` at the latest, as its devices are being started; None: it begins now."""
+    """The devices of a hold are being started, so its runtime begins by `waits`; None: it begins now."""
 
     arc: ArcId
     client: ClientId
@@ -622,7 +625,7 @@ class Dropped(Struct, frozen=True):
 
 
 class WakeAt(Struct, frozen=True):
-    """Send a `Tick` at this time or earlier; replaces the last one. None: nothing to wait for."""
+    """Send a `Tick` by this time; replaces the last `WakeAt`. None: no tick is needed."""
 
     at: Ns | None
 

@@ -1,9 +1,9 @@
-"""Free times of a set of RCs: when a booking would be kept.
+"""Free times of a set of RCs, at which a booking could be kept.
 
 Obstacles: all other bookings and maintenance, whatever their priority; holds that neither end nor yield; and
 reservations of starving ARCs of equal or higher priority. Other queued ARCs avoid bookings. Sharable RCs are asked
-about all holders at that time. The result is exact for the present bindings of earlier bookings; it does not try to
-change them."""
+about all holders at that time. The result is exact if earlier bookings keep their present bindings; others are not
+tried."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ from zscout.scheduling.votes import HolderSet
 from zscout.types import ArcId, Need, Ns, RcName
 
 MAX_TRIED: Final = 4_000
-"""Times checked per question."""
+"""Starts tried per search."""
 
 
 class Slot(NamedTuple):
-    """It may begin at any time from `start` to `latest`; `bound` has the RC for each pattern."""
+    """A booking may begin at any time from `start` to `latest`; `bound` has the RC for each pattern."""
 
     start: Ns
     latest: Ns
@@ -42,14 +42,14 @@ class SlotsFound:
 
 
 class _Taken(NamedTuple):
-    """A time at which an RC is taken, or, if sharable, has this holder."""
+    """A span in which an RC is taken or, if sharable, has this holder."""
 
     start: Ns
     end: float
     arc: ArcId
     excludes: bool = False
     held: bool = False
-    """By a hold, which yields to what begins before."""
+    """By a hold, which yields to a booking that begins before `start`."""
 
 
 def slots(
@@ -63,8 +63,8 @@ def slots(
     presume: bool = False,
     likely: Mapping[ArcId, Ns] = MappingProxyType({}),
 ) -> SlotsFound:
-    """The first `limit` times at which `wanted` might start, until `until`; `arc` represents it. `bookings_only`
-    ignores holds and queue; `presume` counts unknown votes as yes; `likely` has earlier ends of holds, for a guess."""
+    """The first `limit` times, up to `until`, at which `wanted` could start; `arc` represents it. `bookings_only`
+    ignores holds and queue; `presume` counts unknown votes as yes; `likely` has expected earlier ends of holds."""
     search, result = _Search(state, wanted, arc, until, bookings_only, presume, likely), SlotsFound()
     latest: Ns = wanted.start - 1
     for tried, start in enumerate(search.starts(until)):
@@ -114,7 +114,7 @@ class _Search:
         for taken in self._taken.values():
             taken.sort()
         self._over = dict.fromkeys(self._taken, 0)
-        """By bit: how many of those are over at the start tried last. Starts are tried in order."""
+        """By bit: how many of these spans are over at the start tried last. Starts are tried in order."""
 
     def _held(self, rc: Rc) -> Iterable[_Taken]:
         now = self._state.now
@@ -146,7 +146,7 @@ class _Search:
         return sorted({first, *ends})
 
     def fit(self, start: Ns) -> Mapping[Need, RcName] | list[tuple[Rc, HolderSet]] | None:
-        """The binding of its patterns if it starts then; None: impossible; or the votes that decide."""
+        """The binding of its patterns if it starts at `start`, or the votes that decide; None: it can't start."""
         unknown: list[tuple[Rc, HolderSet]] = []
         for rc in self._named:
             free = self._is_free(rc, start)
@@ -170,7 +170,7 @@ class _Search:
         return None if chosen is None else {need: rc.name for need, rc in chosen.items()}
 
     def _is_free(self, rc: Rc, start: Ns) -> bool | HolderSet:
-        """True if `rc` is free from `start` for long enough; or the holders of an unknown vote."""
+        """Whether `rc` is free from `start` for long enough; a set of holders: the vote on it decides."""
         end = start + self._wanted.runtime
         spans, over = self._taken[rc.bit], self._over[rc.bit]
         while over < len(spans) and spans[over].end <= start:

@@ -1,6 +1,6 @@
 """The state that a scheduling pass reads and changes: holders, queue, votes.
 
-Sets of RCs are integer bit masks; `needs & ~free == 0` is the whole test for an ARC of exclusive RCs."""
+Sets of RCs are integer bit masks: an ARC of exclusive RCs can start if `needs & ~free == 0`."""
 
 from __future__ import annotations
 
@@ -27,25 +27,25 @@ from zscout.types import ArcId, ClientId, Grant, Need, Ns, Params, Place, RcName
 
 
 class SchedulerState:
-    """The RCs, the ARCs and their holds. Every change uses these methods."""
+    """The RCs, the ARCs and their holds. Change them by these methods only."""
 
     def __init__(self, policy: SchedulingPolicy = DEFAULT, *, adaptive: bool = False) -> None:
-        """`adaptive`: preemption has a budget, and sets are weighed by runtime."""
+        """`adaptive`: preemption has a budget, and shorter ARCs are worth more."""
         self.policy, self.adaptive = policy, adaptive
         self.runtimes = RuntimeMean()
         self.now: Ns = 0  # the instant of the latest batch of events
         self.votes = Votes()
         self._ends: list[tuple[Ns, ArcId]] = []
-        """A heap of the ends of minimum runtimes and longest times. Outdated entries are skipped."""
+        """A heap of the ends of holds' minimum and longest runtimes. Outdated entries are skipped."""
         self.rcs: dict[RcName, Rc] = {}
         self.queued: dict[ArcId, Arc] = {}
         self.running: dict[ArcId, Arc] = {}
         self.held_back: dict[ArcId, Arc] = {}
-        """Queued ARCs not considered for a while, or while another has their place."""
+        """ARCs that wait but are not considered for now (`ArcState.HELD_BACK`)."""
         self.dates = ClaimIndex()
         self.claims, self.maintenance = self.dates.by_id, self.dates.maintenance
         self._at_place: dict[Place, Arc] = {}
-        """By place: the ARC considered or running. Two clients may claim one ARC, which has to run once."""
+        """By place: the ARC considered or running. Where two clients claim one ARC, only one of them may run it."""
         self.present = 0
         self.unwell = 0  # bits of the present RCs granted to operators only
         self.sharable = 0  # bits of the RCs that vote and take several holders
@@ -57,7 +57,7 @@ class SchedulerState:
         self._matching_masks: dict[Need, int] = {}
         self.classes: dict[Hashable, PatternClass] = {}
         self.chosen: dict[ArcId, ArcId] = {}
-        """By running ARC: the queued one for a pattern of which it is likely to end (`upcoming.py`)."""
+        """By running ARC: the queued ARC that is likely to get one of its RCs for a pattern (`upcoming.py`)."""
         self.running_by_owner: Counter[str] = Counter()
         self.held_by_owner: Counter[str] = Counter()
         self._by_bit: list[Rc] = []
@@ -67,12 +67,12 @@ class SchedulerState:
         self.demand_version = 0  # grows with each change of `Rc.demand`
         self.version = 0  # grows with each change of holders, present RCs and preemptibility
         self.changed: dict[int, float] = {}
-        """By bit of the RCs where it grew: until when that may matter; `Calendar` empties it."""
+        """By bit of the RCs with such a change: the end of the time that it may affect. `Calendar` empties it."""
         self.shares = Shares(self, policy.fair_shares) if policy.fair_shares is not None else None
         """None where fair shares are off."""
 
     def rc(self, name: RcName) -> Rc:
-        """The RC of this name, added (absent, exclusive) if unknown."""
+        """Return the RC of this name; an unknown RC is added as absent and exclusive."""
         rc = self.rcs.get(name)
         if rc is None:
             rc = self.rcs[name] = Rc(name, 1 << len(self._by_bit))
@@ -100,7 +100,7 @@ class SchedulerState:
         return mask
 
     def bind(self, arc: Arc, bound: Mapping[Need, RcName]) -> None:
-        """Bind the patterns of an ARC that does not run to these RCs; empty if a pattern has none."""
+        """Bind the patterns of an ARC that does not run to these RCs: to all or, if `bound` is empty, to none."""
         if arc.bound == bound and arc.rcs:
             return
         wanted, unbound = arc.request.needs, () if bound else arc.patterns
@@ -110,8 +110,8 @@ class SchedulerState:
         arc.rcs = tuple(self.rcs_in(arc.mask))
 
     def new_arc(self, request: ArcRequest, place: Place) -> Arc:
-        """An ARC that neither waits nor runs yet. `max_runtime` of the policy (`max_booking` for a booked ARC) caps its
-        minimum runtime, also in ranks and reservations."""
+        """Return an ARC that is neither queued nor running yet. The policy's `max_runtime` (`max_booking` for a booked
+        ARC) caps its minimum runtime, also for rank and reservations."""
         longest = self.policy.max_booking if request.booking in self.claims else self.policy.max_runtime
         request = request if longest is None else request.at_most(longest)
         patterns = tuple(filter(is_pattern, request.needs))
@@ -123,7 +123,7 @@ class SchedulerState:
 
     @property
     def patience(self) -> Ns:
-        """Of an ARC that is queued now; 0 where none is ever due."""
+        """The patience of an ARC that is queued now; 0 where none is ever due."""
         fixed = self.policy.patience
         return self.runtimes.patience(self.now) if fixed == "runtimes" else fixed or 0
 
@@ -146,12 +146,12 @@ class SchedulerState:
             mask ^= low
 
     def watched_at(self, bits: int) -> list[Watched]:
-        """The RCs and classes whose watchers a change of these RCs concerns."""
+        """The RCs and classes whose watchers a change of these RCs may affect."""
         classes = [like for like in self.index.watched_classes if like.reach & bits]
         return [*self.rcs_in(bits & self.index.watched), *classes]
 
     def next_watcher(self, on: Watched, rank: Rank | None) -> tuple[Rank, int, Arc, Watched] | None:
-        """The best watcher below `rank` (None: of all), as a heap entry."""
+        """The best watcher that ranks below `rank` (None: of all), as a heap entry."""
         at = 0 if rank is None else bisect_right(on.watchers, rank)
         if at == len(on.watchers):
             return None
@@ -199,16 +199,16 @@ class SchedulerState:
         return self.present & ~self.unwell if self.unwell and not self.operator(priority) else self.present
 
     def closed_to(self, arc: Arc) -> int:
-        """Bits of the RCs of `arc` that are absent, or that it is not granted because they are unwell. An ARC that
-        continues another gets the RCs of that one."""
+        """Bits of the RCs of `arc` that are absent, or unwell and not granted to it. An ARC that continues another may
+        have its unwell RCs."""
         closed = arc.mask & ~self.open_to(arc.priority)
         if closed & self.present and (continued := self.continued(arc)) is not None:
             closed &= ~(continued.mask & self.present)
         return closed
 
     def is_free(self, arc: Arc) -> bool:
-        """Return True if a new ARC without quota or pattern finds all RCs exclusive and free, and the queue is
-        empty."""
+        """Return True if a new ARC can start at once: no queue, quota or pattern, and all its RCs exclusive, free and
+        not booked."""
         if self.queued or self.held_back or arc.patterns or arc.place in self._at_place:
             return False
         if arc.mask & self.dates.claimed:
@@ -217,7 +217,7 @@ class SchedulerState:
         return not bound and not self.closed_to(arc) and not arc.mask & (self.busy | self.sharable)
 
     def enter(self, arc: Arc) -> None:
-        """Add a new ARC that starts without being queued."""
+        """Add a new ARC that starts at once, without being queued."""
         arc.rcs = tuple(self.rcs_in(arc.mask))
         self._know(arc)
         self._at_place[arc.place] = arc
@@ -253,7 +253,7 @@ class SchedulerState:
             self._declassify(arc)
 
     def _wanted(self, arc: Arc) -> int:
-        """Bits of the RCs that a queued ARC names, or that match its patterns."""
+        """Bits of the RCs that a queued ARC names or that match its patterns."""
         return arc.named_mask if arc.like is None else arc.named_mask | arc.like.reach
 
     def _classify(self, arc: Arc) -> None:
@@ -261,7 +261,7 @@ class SchedulerState:
         insort(like.members, arc.rank)
 
     def class_for(self, arc: Arc) -> PatternClass:
-        """The class of an ARC with patterns, if it were queued."""
+        """Return the class that an ARC with patterns would be in if it were queued."""
         like = self.classes.get(self._class_key(arc))
         if like is None:
             like = PatternClass()
@@ -285,13 +285,14 @@ class SchedulerState:
         like.usable_of, like.choices = -1, {}
 
     def hold_back(self, arc: Arc, until: Ns, rcs: tuple[RcName, ...]) -> None:
-        """A queued ARC is not considered before then, unless `readmit` admits it."""
+        """Consider a queued ARC no more before `until`, unless one of `rcs` joins."""
         self.dequeue(arc)
         arc.move_to(ArcState.HELD_BACK)
         arc.held_back = until, rcs
         self.held_back[arc.id] = arc
 
     def readmit(self, rc: RcName | None = None) -> None:
+        """Queue the ARCs whose pause is over, or that were held back for `rc`."""
         for arc in list(self.held_back.values()):
             if arc.held_back is not None and (arc.held_back[0] <= self.now or rc in arc.held_back[1]):
                 self.consider_again(arc)
@@ -303,12 +304,12 @@ class SchedulerState:
         return self._at_place.get(place)
 
     def put_before(self, arc: Arc, other: Arc) -> None:
-        """Give new `arc` the place of `other`, which is queued and now waits for its end."""
+        """Give new `arc` the place of queued `other`, which is held back until `arc` has ended."""
         self._at_place[arc.place] = arc
         self.consider_again(other)
 
     def leave_place(self, arc: Arc) -> None:
-        """Free the place of an ended or moved ARC, and consider its other claimants."""
+        """Free the place of an ended or moved ARC, and consider the other ARCs that claim it."""
         if self._at_place.get(arc.place) is arc:
             del self._at_place[arc.place]
             for other in [
@@ -328,7 +329,7 @@ class SchedulerState:
         self.leave_place(arc)
 
     def voter(self, arc: ArcId) -> Arc | None:
-        """The ARC of an id in a set of holders, or the placeholder of a booking."""
+        """The ARC, or the booking's placeholder, that has this id in a set of holders."""
         return self.arc(arc) or (self.claims[arc].arc if arc in self.claims else None)
 
     def _know(self, arc: Arc) -> None:
@@ -348,7 +349,7 @@ class SchedulerState:
         return self._owners.get(owner, {}).values()
 
     def hand_over(self, arc: Arc, to: ClientId, renamed: ArcId) -> None:
-        """Continue an ARC's hold or wait under another client and name."""
+        """Move an ARC, with its hold or its place in the queue, to another client and name."""
         if arc.hold is None:
             self.dequeue(arc)
             self._rename(arc, to, renamed)
@@ -367,7 +368,7 @@ class SchedulerState:
         self._forget_client(arc)
         who = arc.request.who
         if who is not None and who.host:
-            who = structs.replace(who, host="")  # it is the new client's
+            who = structs.replace(who, host="")  # from now on the new client's host
         arc.take(structs.replace(arc.request, arc=name, client=client, who=who))
 
     def start(self, arc: Arc, hold: Hold) -> None:
@@ -397,7 +398,7 @@ class SchedulerState:
         return hold
 
     def retime(self, arc: Arc, hold: Hold) -> None:
-        """Give a running ARC's hold another end."""
+        """Replace the hold of a running ARC by one with another end."""
         before, arc.hold = arc.known_end(), hold
         for end in (hold.end, hold.last):
             if end is not None:
@@ -414,7 +415,8 @@ class SchedulerState:
             self._grow(rc.bit)
 
     def expired_arcs(self) -> Iterator[Arc]:
-        """The running ARCs whose minimum or longest time is over, once each; the caller may end others meanwhile."""
+        """Yield the running ARCs whose minimum or longest runtime is over, once each. The caller may end others
+        meanwhile."""
         while self._ends and self._ends[0][0] <= self.now:
             at, arc_id = heapq.heappop(self._ends)
             arc = self.running.get(arc_id)
@@ -435,7 +437,7 @@ class SchedulerState:
         return self.index.next_starving(self.now) if is_kept else None
 
     def min_runtime_over(self, arc: Arc) -> None:
-        """From now on equals may preempt a kept hold."""
+        """Note that equal priorities may preempt this kept hold from now on."""
         self.index.freed |= arc.mask
         self._grow(arc.mask, 0)
 
@@ -445,11 +447,11 @@ class SchedulerState:
             self.changed[bit] = max(until, self.changed.get(bit, 0))
 
     def operator(self, priority: int) -> bool:
-        """Return True for an operator's priority, which no setting delays."""
+        """Return True for an operator's priority."""
         return priority >= self.policy.operator_priority
 
     def band(self, priority: int) -> int:
-        """ARCs whose priorities share a band respect each other's reservations."""
+        """The band of a priority. ARCs of one band respect each other's reservations."""
         alone = self.policy.promise == "equals" or self.operator(priority)
         return priority if alone else self.policy.operator_priority - 1
 
@@ -463,7 +465,7 @@ class SchedulerState:
         if policy.operator_priority != self.policy.operator_priority:
             self.index.freed |= self.unwell
             self._grow(self.unwell)
-        for arc in self.by_pattern.values():  # other RCs may be barred now
+        for arc in self.by_pattern.values():  # the set of barred RCs may have changed
             self.index.put(arc, ArcState.READY)
             self._declassify(arc)
         self.policy = policy
@@ -505,7 +507,7 @@ class SchedulerState:
         return {} if self.shares is None else self.shares.charged()
 
     def last(self, arc: Arc, start: Ns, end: Ns) -> Ns | None:
-        """When `max_runtime` ends a hold: not before its booking is over."""
+        """When `max_runtime` ends a hold, but not before its booking is over; None: never."""
         limit = self.policy.max_runtime
         if limit is None:
             return None
@@ -514,7 +516,7 @@ class SchedulerState:
     def hold(
         self, arc: Arc, grant: Grant, start: Ns, end: Ns, protected_from: Ns | None = None, runtime: Ns | None = None
     ) -> Hold:
-        """A hold granted to `arc` then. `protected_from`: as reported of one that continues."""
+        """A hold granted to `arc` at `start`. `protected_from`: as its RCs reported it, if the hold was recovered."""
         policy = self.policy
         budget = round(policy.preempt_budget * (arc.request.min_runtime if runtime is None else runtime))
         below: int | None = policy.operator_priority
@@ -526,7 +528,7 @@ class SchedulerState:
         elif protected_from is not None:
             arc.lost = max(0, start + budget - protected_from)
         else:
-            is_due = 0 < arc.patience <= waited - arc.told
+            is_due = 0 < arc.patience <= waited - arc.unproven_wait
             protected_from = start if is_due else start + max(0, budget - arc.lost)
         return Hold(grant, start, end, below, self.last(arc, start, end), protected_from, runtime=runtime)
 
@@ -537,7 +539,7 @@ class SchedulerState:
         return max(0, quota - self.running_by_owner[arc.owner] + (self.continued(arc) is not None))
 
     def rc_quota(self, arc: Arc, starting: Mapping[str, int] = MappingProxyType({})) -> RcQuota | None:
-        """The RC quota that has no room for `arc`, beside the `starting` RCs of each owner."""
+        """The RC quota that `arc` would exceed; `starting`: by owner, the number of RCs of ARCs about to start."""
         quotas = self.policy.rc_quotas.get(arc.owner, ())
         ends = len(continued.rcs) if quotas and (continued := self.continued(arc)) is not None else 0
         for quota in quotas:
@@ -547,7 +549,7 @@ class SchedulerState:
         return None
 
     def continued(self, arc: Arc) -> Arc | None:
-        """The running ARC that `arc` continues and ends by its start: quotas don't count it."""
+        """The running ARC that `arc` continues and replaces when it starts: quotas don't count it."""
         if arc.request.continues:
             for rc in self.rcs_in(arc.mask & ~self.sharable):
                 for holder in rc.holders.values():
@@ -556,12 +558,12 @@ class SchedulerState:
         return None
 
     def barred(self, arc: Arc) -> int:
-        """Bits of the RCs to which no pattern of `arc` is bound."""
+        """Bits of the RCs that the patterns of `arc` may not be bound to."""
         patterns = self.policy.barred.get(arc.owner, ()) if arc.patterns else ()
         return union(map(self.matching_mask, patterns))
 
     def is_barred(self, arc: Arc) -> bool:
-        """Whether it names an RC that its owner may not hold (any more)."""
+        """Return True if it names an RC that its owner may not hold now."""
         patterns = self.policy.barred.get(arc.owner, ()) if self.policy.barred else ()
         return any(matcher(pattern)(need) for pattern in patterns for need in arc.request.needs if not is_pattern(need))
 
@@ -607,18 +609,18 @@ class SchedulerState:
 
 
 class Actions(Protocol):
-    """Actions of a strategy: each changes the state at once and becomes an effect."""
+    """The actions of a strategy. Each changes the state at once and becomes an effect."""
 
     def start(self, arc: Arc) -> None: ...
     def preempt(self, arc: Arc, by: Arc) -> bool: ...
 
     def wait(self, arc: Arc, reason: Reason, *, settled: bool = True) -> None: ...
     def propose(self, rc: Rc, holders: HolderSet) -> bool:
-        """Return False if the RC is asked about it already, or silent and not due."""
+        """Return False if this proposal is already open, or the RC is unresponsive and not due."""
         ...
 
     def run_again(self) -> None:
-        """Ask for another pass at once: the strategy needs more time, after others."""
+        """Request another pass at once: the strategy needs more time, but other events come first."""
         ...
 
 
@@ -631,5 +633,5 @@ class Strategy(Protocol):
         """One pass over the state."""
 
     def log_line(self) -> str:
-        """News for the log since the last call; mostly empty."""
+        """A line for the log about the passes since the last call; mostly empty."""
         return ""
