@@ -140,7 +140,7 @@ class AccessPolicy(Struct, frozen=True, dict=True):
         return self.refusal_text(name, what, [other for other, ranks in self.ranks.items() if ranks & {*needed}])
 
     def refusal_text(self, name: str, what: str, permitted: Collection[str]) -> str:
-        """`name` may not do `what`, and which names may."""
+        """The text that `name` may not do `what`, and which names may."""
         ranks, names = self.ranks_of(name), sorted(permitted)
         title = f"{name} ({', '.join(sorted(ranks))})" if ranks else f"{name}, which has no role here,"
         more = f" and {len(names) - MAX_NAMED} more" if len(names) > MAX_NAMED else ""

@@ -273,7 +273,7 @@ def _check_roles(host: str, rcs: Iterable[str], access: AccessPolicy, top: Where
     """Raises BadInput if the roles do not allow this host or its RCs."""
     if not access.ranks_of(host) & MACHINES:
         remedy = "name it under [roles] of the fleet file, as manager or under node"
-        raise (top / "node" / "host").bad(f"{quoted(host)} is not a machine of this fleet", remedy)
+        raise (top / "node" / "host").bad(f"{quoted(host)} is neither a manager nor a node of this fleet", remedy)
     for number, rc in enumerate(rcs):
         if not access.may_serve(host, rc):
             remedy = f"name it at {host} under [roles.node] of the fleet file"

@@ -93,7 +93,7 @@ class Balancer:
         load, memory = report.load_average[0], report.memory_available
         if not (0 <= load <= LARGEST and 0 <= memory <= LARGEST and report.cores >= SMALLEST):
             figures = f"load_average {load}, memory_available {memory} and cores {report.cores}"
-            raise ValueError(f"{figures}: no host has that")
+            raise ValueError(f"{figures} are impossible")
         last = self.reports.get(report.host)
         if last is not None and report.number <= last[1].number and now - last[0] < STALE:
             return

@@ -68,7 +68,7 @@ class MemoryNetwork:
     """The processes of a fleet, and the links between them.
 
     All times are in seconds. `delay`: of every link. `lease`: how long a process waits for a silent peer, less a random
-    part of it, `impatience` at most. `relink`: the longest time from when a lost link could work until it does."""
+    part of it, `impatience` at most. `relink`: the longest time until a lost link that could work is restored."""
 
     def __init__(
         self,

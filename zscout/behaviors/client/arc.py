@@ -247,7 +247,7 @@ class Attempt:
         return self._needs_new_request or (self.arc is not None and self.arc.open)
 
     async def asked(self) -> OpenArc:
-        """Return the request, made now unless it was before. Raises RequestRefused."""
+        """Return the request; submit it first if needed. Raises RequestRefused."""
         if self._needs_new_request or self.arc is None:
             self.arc, self._needs_new_request = None, False
             self.arc = await self._client.request(**self._ask)

@@ -478,7 +478,8 @@ class RequestStore:
                 self.forget(arc)
 
     def _submit_under_new_id(self, arc: OpenArc) -> None:
-        """Submit under a new id, at its place, a request whose time was over before this client had its grant."""
+        """Submit a request again, under a new id at its old place: its time was over before this client received the
+        grant."""
         del self.arcs[arc.id]
         arc._take_back(new_instance(), "its time was over before this client learned of the grant", self._now())
         arc.booking = ""  # the booking's time is over too

@@ -29,7 +29,7 @@ def zone_of(name: str) -> ZoneInfo:
 
 
 def dates(booking: BookingRecord, after: float, before: float) -> list[Instant]:
-    """Starts from `after` until before `before`, including dates given up. Raises ValueError for an unknown zone."""
+    """Starts in [`after`, `before`), including cancelled dates. Raises ValueError for an unknown zone."""
     return Repetition(booking).between(after, before)
 
 

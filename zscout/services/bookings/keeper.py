@@ -141,8 +141,8 @@ class BookingKeeper:
 
     def observe(self, grants: messages.Grants) -> None:
         """Take a publication of the leader. A delayed publication, such as an earlier leader's after a stall, shows too
-        early a time; the start of the run of fleet time does not depend on the delay. A leader that began without fleet
-        time has a younger time, until it learns ours."""
+        early a fleet time, but no delay changes when fleet time began. The fleet time of a leader that began without
+        any is younger than ours, until it learns ours."""
         if grants.time is None:
             return
         self._check_queried(grants)

@@ -164,7 +164,7 @@ class Follower:
                 yield from self._in_force(_viewed(hold, at))
 
     def lost(self, gap: messages.JournalGap) -> Iterator[Change]:
-        """Changes could not be stored, possibly ends of holds."""
+        """The journal could not store changes, possibly ends of holds: mark the gap, and read the journal again."""
         self._doubt, self.must_read = gap.began if self._doubt is None else min(self._doubt, gap.began), True
         yield GapSeen(gap)
 

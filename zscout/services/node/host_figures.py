@@ -215,7 +215,7 @@ def temperature() -> float | None:
 
 
 def speed(tries: int = TRIES) -> float:
-    """Speed of one core at Python: 1.0 takes a processor millisecond for the benchmark. Takes 2 ms a try."""
+    """Speed of one core for Python code; 1.0 is a core that runs the benchmark in 1 ms. A try takes about 2 ms."""
     best = math.inf
     for _ in range(tries):
         # Thread time: other load does not slow the result.

@@ -351,7 +351,7 @@ class Candidate:
         return await self._lead(term, states, asking, kept)
 
     async def _weigh_refusals(self, source: Source, refusals: list[tuple[str, Term] | None]) -> None:
-        """Judge the higher terms that RCs or clients obey, by their tokens where these matter."""
+        """Judge the higher terms in refusals of RCs or clients. Query tokens if a verdict needs the host of a key."""
         keys, hosts = self.mesh.keys, dict[str, str]()
         shown = [(key, term) for key, term in filter(None, refusals) if self.terms.is_news(term, source)]
         if any(self.terms.secured or absurd(term, self.known) for _, term in shown):

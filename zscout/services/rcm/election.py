@@ -168,11 +168,11 @@ class Election:
         return now - lone.since >= LEADER_WAIT + self.silence
 
     def must_wait(self, others: Mapping[HostName, bool], own: bool, now: Ns) -> bool:
-        """Return True if RCs show a leader: most other hosts do (`views`), or this host (`own`).
+        """Return True if RCs show a leader: the RCs of most other hosts (`others`), or of this host (`own`).
 
-        This host's RCs count only if no other host answers, as they see the same as this candidate. If this host may be
-        cut off, the candidate waits one more silence. While links return, one host that shows a leader is enough, as
-        the link to that leader may return next."""
+        `own` counts only if no other host answers: this host's RCs see no more than this candidate. If this host may
+        be cut off, the candidate waits one more silence. While links return, a single host that shows a leader is
+        enough, as the link to that leader may return next."""
         sights = others.values()
         if others:
             self._alone_since = None

@@ -236,7 +236,7 @@ class Recorder:
                 self._wanted.set()
 
     async def _read(self) -> bool:
-        """Whether the state is known now. Without a leader, the token of the next wakes `_keep_reading`."""
+        """Return True if the state is known now. Without a leader, the token of the next wakes `_keep_reading`."""
         key, ask = self.mesh.keys.ask_state(self.mesh.me), messages.StateAsk()
         replies = await self.mesh.ask(key, ask, messages.RcmState, timeout=READ_TIMEOUT)
         states = [reply.message for reply in replies if reply.message is not None]
