@@ -200,7 +200,7 @@ class VirtualTimeLoop(asyncio.SelectorEventLoop):
             self._timer_cancelled_count -= 1
 
     def forget(self, process: Process) -> None:
-        """Drop the callbacks of a killed process's timers, to free their memory. The timers keep their places."""
+        """Drop the callbacks of a killed process's timers, to free their memory. The timers remain in the heap."""
         for _, timer in self._scheduled:
             if timer._context.get(PROCESS) is process and not timer._cancelled:
                 timer._callback, timer._args = _do_nothing, ()
