@@ -39,6 +39,8 @@ def test_thrown_away_is_what_was_taken_back_before_its_time() -> None:
         assert account.preempted == (outcome == "preempted")
     (kept,) = by_arc(past(1, 110.0, 180.0, "lost"))
     assert kept.thrown_away == 0.0
+    (command,) = by_arc(past(1, 110.0, 180.0, "preempted"))
+    assert command.thrown_away == 70.0, "it was protected for longer than its minimum runtime"
 
 
 def test_an_unheard_end_counts_what_is_known() -> None:

@@ -4,12 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import Final
 
 from zscout.messages import PastHold
 from zscout.services.journal.merging import Span
-
-THROWN_AWAY: Final = frozenset({"preempted", "lost"})  # outcomes of holds ended against the holder's will
 
 
 @dataclass(slots=True)
@@ -40,7 +37,9 @@ def accounts(
         if held < 0:
             continue
         ends_here = hold.ended is not None and hold.ended <= window.ended
-        short = hold.min_runtime is None or ended - hold.began < hold.min_runtime
+        # A preempted hold had not had the time for which it was protected, which may be more than `min_runtime`.
+        is_short = hold.min_runtime is None or ended - hold.began < hold.min_runtime
+        thrown_away = hold.outcome == "preempted" or (hold.outcome == "lost" and is_short)
         for key in dict.fromkeys(keys(hold)):
             account = found.setdefault(key, Account(key))
             account.holds += 1
@@ -56,6 +55,6 @@ def accounts(
             if ends_here and hold.outcome == "preempted":
                 account.preempted += 1
                 account.preempted_seconds += held
-            if ends_here and short and hold.outcome in THROWN_AWAY:
+            if ends_here and thrown_away:
                 account.thrown_away += held
     return sorted(found.values(), key=lambda account: (-account.held, account.key))
