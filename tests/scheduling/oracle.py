@@ -13,7 +13,7 @@ from itertools import product
 from zscout.config.scheduling_policy import FairShares
 from zscout.keyexpr import is_pattern, matcher
 from zscout.scheduling.capacity import excess
-from zscout.scheduling.fair_shares import LITTLE, NEAR
+from zscout.scheduling.fair_shares import NEAR_RATIO, NEAR_RC_SECONDS
 from zscout.scheduling.model import QUANTUM, ArcRequest, Outcome
 from zscout.simulation.replay import HoldRecord, Replay
 from zscout.simulation.workload import Arrival, Workload, WorkloadRc
@@ -69,7 +69,7 @@ class SlowShares:
         found: dict[str, int] = {}
         position, first = 0, shares[0][0] if shares else 0.0
         for share, group in shares:
-            if share - first > LITTLE and share - first > NEAR * share:
+            if share - first > NEAR_RC_SECONDS and share - first > NEAR_RATIO * share:
                 position, first = position + 1, share
             found[group] = position
         return found

@@ -17,7 +17,7 @@ from tests.scheduling.workloads import voter, workloads
 from tests.services.recorder.paper_run import table1
 from tests.thorough import times
 from zscout.config.scheduling_policy import StrategyName
-from zscout.scheduling.adaptive import MAX_SLICES, SLICE, Adaptive, steps_for
+from zscout.scheduling.adaptive import MAX_SLICES, SLICE_STEPS, Adaptive, steps_for
 from zscout.scheduling.conflict_groups import density
 from zscout.scheduling.core import Core
 from zscout.scheduling.forecast import play_instant
@@ -187,11 +187,11 @@ def test_a_large_search_is_cut_into_slices_and_others_go_on() -> None:
     assert core._state.running.keys() == {"other"}
     passes = 2
     while wants_more(0, effects):
-        assert steps(strategy) - before <= SLICE
+        assert steps(strategy) - before <= SLICE_STEPS
         before = steps(strategy)
         effects = core.handle(0, Tick())
         passes += 1
-    assert passes <= steps_for(600) / SLICE + 3
+    assert passes <= steps_for(600) / SLICE_STEPS + 3
     validate(core)
     plain = free(300, "priority")
     plain.handle(0, *map(Requested, experiment(0, 300, 600)))

@@ -110,7 +110,9 @@ class Pair:
         self.slow.pass_time(self.now, holds, waiting, {rc.name for rc in state.rcs.values() if rc.present})
         self.core.handle(self.now, *(self.event() for _ in range(draw.choice((1, 1, 3)))))
         validate(self.core)
-        wanted = {group: had for group, had in self.slow.charged.items() if had > 1.01 * fair_shares.FORGOTTEN}
+        wanted = {
+            group: had for group, had in self.slow.charged.items() if had > 1.01 * fair_shares.FORGOTTEN_RC_SECONDS
+        }
         told = self.core.charged()
         for group in wanted.keys() | told.keys():
             assert told.get(group, 0) == pytest.approx(wanted.get(group, 0), rel=1e-6, abs=1.1)
@@ -265,7 +267,7 @@ def test_no_more_accounts_are_kept_than_that(monkeypatch: pytest.MonkeyPatch) ->
 def test_nobody_waits_longer_than_promised_whoever_goes_first(
     seeds: Sequence[int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(fair_shares, "LITTLE", 0.1)
+    monkeypatch.setattr(fair_shares, "NEAR_RC_SECONDS", 0.1)
     patience, tried, others = 6 * SECOND, 0, 0
     policy = SchedulingPolicy(patience=patience)
     fair = SchedulingPolicy(patience=patience, fair_shares=FairShares(20 * SECOND, patience=3 * patience))

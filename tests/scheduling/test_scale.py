@@ -237,7 +237,7 @@ def test_an_indexed_pass_is_a_full_pass(size: Size, seed: int) -> None:
 
 @pytest.mark.parametrize("size", SIZES.values(), ids=SIZES)
 def test_so_it_is_where_the_order_of_groups_changes(size: Size, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(fair_shares, "LITTLE", 0.1)
+    monkeypatch.setattr(fair_shares, "NEAR_RC_SECONDS", 0.1)
     sort, sorted_anew = QueueIndex.sort, [0]
 
     def counted(index: QueueIndex, queued: Mapping[str, Arc], rcs: Iterable[Rc]) -> None:

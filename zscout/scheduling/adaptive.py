@@ -3,21 +3,20 @@
 A pass:
 
 1. Reserve RCs for ARCs that have waited too long (`reservations.py`).
-2. Take the undecided ARCs, in groups without a common RC (`conflict_groups.py`).
-3. Take each group's set by the heuristic, counting unknown votes as yes. A set at the upper bound can't be improved:
-   its group is left to step 6.
-4. Elsewhere search the best set: by branch and bound, or by local search where that takes too long.
-5. Ask the votes that a better set needs, and take the set once they are in. While a group is searched or its votes are
-   out, it is off limits; the other groups continue.
+2. Find the undecided ARCs, in groups without a common RC (`conflict_groups.py`).
+3. Compute each group's set by the heuristic, counting unknown votes as yes. If its value is the upper bound, it can't
+   be improved, and the group is left to step 6.
+4. For the other groups search the best set: by branch and bound, or by local search where that takes too long.
+5. Ask for the votes that a better set needs, and take the set once they are in. While a group is searched or its votes
+   are out, it is off limits; the other groups continue.
 6. Run a pass of `priority` over the rest.
 
-Search time is counted in steps. A pass takes one slice and asks for another pass at once, so the RCM answers between
+Search time is counted in steps. A pass takes one slice and requests another pass at once, so the RCM answers between
 slices. A search works on a snapshot: when the group has changed, it restarts from the rest of its best set. Slices and
-rounds of votes of a group are bounded; then it takes the best set that needs no more votes, or leaves the group to
-`priority`.
+rounds of votes of a group are bounded; beyond them the group is left to `priority`.
 
-A pair of ARC and RC is worth the more the shorter the ARC's minimum runtime (`conflict_groups.density`). Each pass is
-worth at least as much as one of `priority`, among the ARCs that no reservation holds back."""
+The shorter an ARC's minimum runtime, the more each of its RCs is worth (`conflict_groups.density`). Each pass is worth
+at least as much as a pass of `priority`, among the ARCs that no reservation holds back."""
 
 from __future__ import annotations
 
@@ -37,14 +36,14 @@ from zscout.scheduling.state import Actions, SchedulerState, Strategy
 from zscout.scheduling.votes import HolderSet
 from zscout.types import ArcId
 
-WORK: Final = 20_000
-"""Steps of branch and bound times items: some 3 ms."""
+PACKING_WORK: Final = 20_000
+"""The budget of a pass for branch and bound, in steps times items: some 3 ms."""
 MAX_PACKED: Final = 60
 """Larger groups go to local search at once."""
-SLICE: Final = 150
+SLICE_STEPS: Final = 150
 """Steps of local search in one pass: some 3 ms."""
 MAX_STARTABLE: Final = 1_000
-"""With more ARCs that could start at one instant, `priority` decides."""
+"""If more ARCs could start at one instant, `priority` decides."""
 MAX_STEPS: Final = 6_500
 MAX_SLICES: Final = 48
 """Passes that search one group, restarts included."""
@@ -55,7 +54,7 @@ SEARCHING: Final = Reason(ReasonCode.SEARCHING)
 
 
 def steps_for(size: int) -> int:
-    """Steps that a group of `size` ARCs is worth: 246 for 100, 5,480 for 600."""
+    """Steps of local search for a group of `size` ARCs: 246 for 100, 5,480 for 600."""
     return min(MAX_STEPS, size * (85 + size) // 75)
 
 
@@ -68,12 +67,12 @@ class _Search:
     heuristic: int
     best: int
     begun: bool = False
-    inexact: bool = False  # not proven optimal: the heuristic's set must pass the votes before it serves as baseline
+    inexact: bool = False  # not proven optimal: votes must first accept the heuristic's set, the baseline
     local: LocalSearch | None = None  # None before the search begins, and after it has ended
     steps: int = 0
     slices: int = 0
     rounds: int = 0
-    asked: list[tuple[Rc, HolderSet]] | None = None  # the last round of proposals
+    last_proposals: list[tuple[Rc, HolderSet]] | None = None  # the last round of proposals
 
     @property
     def exhausted(self) -> bool:
@@ -101,10 +100,10 @@ class Adaptive(Strategy):
         self._log_line = ""
         self._reserved: Reservations | None = None
         self._searches: dict[ArcId, _Search] = {}
-        self._work = 0  # steps that this pass may still spend on branch and bound
-        self._steps = 0
+        self._work = 0  # the rest of `PACKING_WORK` in this pass
+        self._steps = 0  # the rest of `SLICE_STEPS` in this pass
         self._unfinished: list[_Search] = []
-        self._seen: tuple[int, ...] = ()  # the situation of the unfinished searches
+        self._seen: tuple[int, ...] = ()  # the `_situation` of the unfinished searches
 
     def log_line(self) -> str:
         """Report where a search has beaten the heuristic, and at what cost."""
@@ -112,10 +111,10 @@ class Adaptive(Strategy):
         return line
 
     def run_pass(self, state: SchedulerState, actions: Actions) -> None:
-        if self._reserved is None and not state.claims and not self._searches and _one_without_choice(state):
+        if self._reserved is None and not state.claims and not self._searches and _is_single_without_choice(state):
             priority.run_pass(state, actions)
             return
-        self._work, self._steps = WORK, SLICE
+        self._work, self._steps = PACKING_WORK, SLICE_STEPS
         if self._unfinished and self._nothing_new(state) and not any(map(self._advance, self._unfinished)):
             actions.run_again()
             return
@@ -127,12 +126,11 @@ class Adaptive(Strategy):
         held, plan = take_all(state, reserved, plan, decided, actions)
         priority.run_pass(state, actions, off_limits=held, reserved=reserved, plan=plan)
         if state.queued and reserved is not None and reserved.starving and not reserved.current:
-            actions.run_again()  # what this pass has changed may let others start that reservations held back
+            actions.run_again()  # reservations may have changed, and no longer hold back some ARCs
         self._seen = _situation(state)
 
     def _reserve(self, state: SchedulerState) -> Reservations | None:
-        """Reserve for the starving ARCs. Where a reservation has ended or changed, ARCs that it held back are
-        checked again."""
+        """Reserve for the starving ARCs. ARCs that an ended or changed reservation held back are checked again."""
         if state.policy.patience is None and not state.claims and self._reserved is None:
             return None
         before = self._reserved
@@ -158,8 +156,8 @@ class Adaptive(Strategy):
                 return "left"
             if not search.begun and self._work > 0:
                 self._begin(search)
-            asked = self._ask(group, search, search.heuristic, actions) if search.inexact else "yes"
-            if asked == "yes":
+            outcome = self._propose_missing(group, search, search.heuristic, actions) if search.inexact else "yes"
+            if outcome == "yes":
                 if not self._advance(search):
                     for arc in group.arcs:
                         if arc.hold is None:
@@ -169,27 +167,27 @@ class Adaptive(Strategy):
                     return "open"
                 if not search.gains:
                     return "left"
-                asked = self._ask(group, search, search.best, actions)
-            if asked == "yes":
+                outcome = self._propose_missing(group, search, search.best, actions)
+            if outcome == "yes":
                 if group.flickers(search.best):
                     return "left"
                 self._report_gain(group, search)
                 return search.best
-            if asked == "open":
+            if outcome == "open":
                 return "open"
             earlier = [search]
         return "left"
 
-    def _ask(
+    def _propose_missing(
         self, group: ConflictGroup, search: _Search, chosen: int, actions: Actions
     ) -> Literal["yes", "no", "open"]:
-        """Ask the unknown votes about a set. `no`: a silent RC rules the set out, which is barred now."""
+        """Ask for the unknown votes on a set. `no`: a veto or a silent RC rules the set out, and it is barred now."""
         proposals = group.missing_votes(chosen)
         if proposals == []:
             return "yes"
-        if proposals is None or proposals != search.asked:
+        if proposals is None or proposals != search.last_proposals:
             search.rounds += 1
-            search.asked = proposals
+            search.last_proposals = proposals
         if proposals is None:
             return "no"
         for rc, holders in proposals:
@@ -214,7 +212,7 @@ class Adaptive(Strategy):
         return search
 
     def _advance(self, search: _Search) -> bool:
-        """Continue a search while this pass has time. True: it has ended."""
+        """Continue a search with the steps left in this pass. Return True if it has ended."""
         if search.exhausted or not search.begun:
             return search.exhausted
         local = search.local
@@ -234,7 +232,7 @@ class Adaptive(Strategy):
         search.begun = True
         problem, size = search.problem, len(search.items)
         if size <= MAX_PACKED:
-            packing = pack(problem, WORK // size)
+            packing = pack(problem, PACKING_WORK // size)
             self._work -= packing.nodes * size
             search.steps += packing.nodes
             if packing.exact:
@@ -252,7 +250,7 @@ class Adaptive(Strategy):
         self._log_line = f"adaptive: RC assignments {', '.join(changed)}, in {search.steps} steps"
 
 
-def _one_without_choice(state: SchedulerState) -> bool:
+def _is_single_without_choice(state: SchedulerState) -> bool:
     """Return True for the usual case of one waiting ARC whose victims are obvious: `priority` is enough."""
     if len(state.queued) != 1 or state.policy.promise != "equals":
         return False

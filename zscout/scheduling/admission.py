@@ -58,8 +58,8 @@ class AdmissionCheck:
         return union(arc.mask for arc in (self.arc, *self.exclusive_victims.values(), *self._preemptible_sharers()))
 
     def obstacle(self, off_limits: int) -> Inadmissible | None:
-        """An RC that keeps the ARC out by itself, apart from RCs `off_limits`. Prefers a hold likely to last: that
-        saves checks."""
+        """An RC that alone keeps the ARC out; holders and vetoes of RCs `off_limits` don't count. Prefers a hold likely
+        to last, to save checks."""
         if closed := self.state.closed_to(self.arc):
             rcs = list(self.state.rcs_in(closed))
             absent = [rc for rc in rcs if not rc.present]
@@ -80,7 +80,7 @@ class AdmissionCheck:
         return None
 
     def _held(self) -> Reason:
-        """The holders in its way: of a named RC, or of all choices for a pattern."""
+        """The reason with the holders in its way: of named RCs, and of all choices for each unmet pattern."""
         arc, number = self.arc, len(self.non_preemptible)
         if not arc.patterns:
             shown = self.non_preemptible[:SHOWN]
@@ -93,7 +93,7 @@ class AdmissionCheck:
             if rc.bit & known:  # two patterns may have the same choices
                 continue
             need = bound[rc.name]
-            # Of `fg/*` and `fg/*#2`, which have the same choices, those that are not met.
+            # `fg/*` and `fg/*#2` have the same choices: keep the unmet patterns of such a group.
             unmet = (bound[rc.name] for rc, _ in self.non_preemptible if rc.name in bound)
             needs = [other for other in dict.fromkeys(unmet) if base(other) == base(need)]
             for choice in sorted(self.state.matching(need), key=attrgetter("name")):
@@ -112,12 +112,12 @@ class AdmissionCheck:
         )
 
     def _preferred(self) -> str:
-        """The group preferred by fair shares, if one of its holders is in the way for that."""
+        """The group that fair shares prefer, if a holder of it is in the way for this reason alone."""
         shares = self.state.shares
         return "" if shares is None else shares.preferred(self.arc, (holder for _, holder in self.non_preemptible))
 
     def masked_obstacles(self) -> int:
-        """Bits of the RCs that keep the ARC out at present, whether off limits or not."""
+        """Bits of the RCs that keep the ARC out now, off limits or not."""
         vetoing = (rc.bit for rc in self._sharables if (answer := self._answer(rc)) is not None and not answer.accept)
         return union(rc.bit for rc, _ in self.non_preemptible) | union(vetoing)
 
@@ -143,7 +143,7 @@ class AdmissionCheck:
         return Admissible(sorted(victims, key=lambda arc: arc.rank), self._presumed)
 
     def refusal(self) -> Reason | None:
-        """The veto that keeps the ARC out, else that an RC does not answer; None if there is neither."""
+        """The reason if an RC vetoes the ARC, else if an RC does not answer; None if neither is so."""
         unresponsive = None
         for rc in self._sharables:
             answer = self._answer(rc)
@@ -197,7 +197,7 @@ class AdmissionCheck:
 
 
 def judge(check: AdmissionCheck, reserved: Reservations | None, off_limits: int = 0) -> Verdict:
-    """The verdict of the first step that keeps the ARC out, or who ends for it."""
+    """The verdict of the first step that keeps the ARC out, or the victims that end when it starts."""
     state, arc = check.state, check.arc
     obstacle = check.obstacle(off_limits)
     if obstacle is not None:
@@ -223,8 +223,10 @@ def judge_bindings(
     *,
     presume: bool = False,
 ) -> Verdict | None:
-    """Bind an ARC with patterns: `planned`, then the best bindings, until it may start or only votes keep it out; else
-    the first. Return the verdict on that; None: no binding."""
+    """Bind an ARC with patterns, and return the verdict on this binding; None: there is no binding.
+
+    Tries `planned`, then the best bindings, until the ARC may start or only votes keep it out. If none does, it keeps
+    the first."""
     without, found = 0, choices(state, arc, reserved)
     best: tuple[Mapping[Need, RcName], Verdict] | None = None
     for _ in range(MAX_BINDINGS):
@@ -238,7 +240,7 @@ def judge_bindings(
         blamed = _blamed(state, arc, verdict, off_limits)
         if best is None or not blamed:
             best = arc.bound, verdict
-        # What is planned waits for the votes of others: elsewhere it might be in the way of a lower rank.
+        # A planned binding waits for the votes of others: another one might be in the way of a lower rank.
         if not blamed or (is_planned and verdict == "off limits"):
             break
         without |= blamed
@@ -247,7 +249,7 @@ def judge_bindings(
 
 
 def _blamed(state: SchedulerState, arc: Arc, verdict: Verdict, off_limits: int) -> int:
-    """Bits of the bound RCs that keep the ARC out, where others might not."""
+    """Bits of the RCs bound to its patterns that keep the ARC out, where other choices might not."""
     unresponsive = state.votes.unresponsive
     match verdict:
         case Inadmissible(rc, _, proposal) if proposal is None or rc.name in unresponsive:

@@ -26,19 +26,21 @@ from zscout.scheduling.votes import HolderSet
 from zscout.types import ArcId, Ns
 
 SCALE: Final = 1 << 32
+"""Makes densities whole numbers."""
 
 
 def undecided_arcs(
     state: SchedulerState, reserved: Reservations | None = None, limit: int | None = None, plan: BindingPlan = NO_PLAN
 ) -> tuple[list[Arc], int] | None:
-    """The queued ARCs that might start, best-ranked first, then the running ARCs that might end; None: over `limit`.
-    ARCs are bound as planned; the others to what these leave, as far as possible. And bits of the RCs of others, which
-    wait for votes on what is reserved."""
+    """The queued ARCs that might start, best-ranked first, then the running ARCs that might end; and bits of the RCs of
+    ARCs that wait for a vote on a reservation. None: more than `limit` could start.
+
+    ARCs are bound as planned, the others to the remaining RCs as far as possible."""
     if state.by_pattern:
         bind_all(state, reserved, plan.mask)
     search = _Search(state, reserved, plan)
     found = search.run(limit)
-    return None if found is None else (found, search.asked)
+    return None if found is None else (found, search.awaiting_votes)
 
 
 class _Search:
@@ -48,11 +50,11 @@ class _Search:
         self._heap: list[
             tuple[Rank, int, Arc, Watched | None]
         ] = []  # candidates, each by itself or as a watcher of an RC
-        self._called: set[Watched] = set()  # those with a watcher in the heap
+        self._called: set[Watched] = set()  # RCs and classes with a watcher in the heap
         self._started: Counter[str] = Counter()  # by owner with a quota: ARCs that might start
         self._taken: Counter[str] = Counter()  # by owner with a quota: RCs of these ARCs
-        self.asked = 0  # bits of RCs of ARCs that wait for a vote on what is reserved
-        self._shared_taken = 0  # sharable RCs where one ARC already passed the starving ones; a second was not checked
+        self.awaiting_votes = 0  # bits of the RCs of ARCs that wait for a vote on a reservation
+        self._shared_taken = 0  # bits of sharable RCs where an ARC passed the starving ARCs; a second isn't checked
 
     def run(self, limit: int | None) -> list[Arc] | None:
         index = self.state.index
@@ -114,7 +116,7 @@ class _Search:
         shared = arc.mask & reserved.bits & self.state.sharable
         conflict = reserved.conflict(arc)
         if conflict is not None and conflict.proposal and conflict.rc.name not in self.votes.unresponsive:
-            self.asked |= arc.mask
+            self.awaiting_votes |= arc.mask
         if shared & self._shared_taken or conflict is not None:
             return True
         if not arc.starving:
@@ -147,9 +149,9 @@ def conflict_groups(
     """The groups with a choice, best-ranked first; none if more than `limit` ARCs could start.
 
     One ARC, or one queued ARC without sharable RCs in its group, leaves no choice: `priority` starts it."""
-    arcs, asked = undecided_arcs(state, reserved, limit, plan) or ((), 0)
+    arcs, awaiting_votes = undecided_arcs(state, reserved, limit, plan) or ((), 0)
     return [
-        ConflictGroup(state, members, reserved, plan, asked)
+        ConflictGroup(state, members, reserved, plan, awaiting_votes)
         for members in split(arcs)
         if len(members) > 1
         and (sum(arc.hold is None for arc in members) > 1 or any(arc.mask & state.sharable for arc in members))
@@ -157,7 +159,7 @@ def conflict_groups(
 
 
 Decision: TypeAlias = int | Literal["open", "left"]
-"""The set of a group. `left`: to `priority`; `open`: off limits for now."""
+"""The set of a group. `left`: `priority` decides; `open`: undecided, and off limits for now."""
 
 
 def take_all(
@@ -167,8 +169,10 @@ def take_all(
     decided: Sequence[tuple[ConflictGroup, Decision]],
     actions: Actions,
 ) -> tuple[int, BindingPlan]:
-    """Take these sets; the bits that are off limits to a pass after that, and its plan. Where that pass
-    would end a hold of this instant, or might after a veto, the group that has its ARC is left to it, else all are."""
+    """Take these sets. Return the bits that are off limits to the following pass of `priority`, and its plan.
+
+    If that pass would end a hold granted at this instant, or might after a veto, the groups with such an ARC are left
+    to it, or all groups if none has one."""
     held = union(group.off_limits for group, chosen in decided if chosen == "open")
     taken = [(group, chosen) for group, chosen in decided if isinstance(chosen, int)]
     while taken and plan is not NO_PLAN:
@@ -213,9 +217,9 @@ def split(arcs: Iterable[Arc]) -> list[list[Arc]]:
 
 
 def _level_key(arc: Arc, first: set[ArcId], last: int, now: Ns) -> tuple[int, int]:
-    """Sort key of levels, by priority, best smallest. A protected hold counts at least as the highest priority that
-    can't end it. Among equals come the ARCs in `first` and holds within their minimum runtime, then the rest by
-    position, up to `last`; holds that yield come last."""
+    """Sort key of levels, best first, by priority. A protected hold counts at least as the highest priority that can't
+    end it. Among equals the ARCs in `first` and holds within their minimum runtime precede; the others follow by
+    position, holds that yield with the position `last`."""
     if (below := arc.protected_below(now)) is not None:
         return min(-arc.priority, 1 - below), 0
     if arc.past_min_runtime(now) if arc.hold is not None else arc.id not in first:
@@ -225,7 +229,7 @@ def _level_key(arc: Arc, first: set[ArcId], last: int, now: Ns) -> tuple[int, in
 
 
 def density(runtime: Ns) -> int:
-    """The worth of an RC in use for so long: the shorter the more, as whoever waits behind it waits less."""
+    """The worth of each RC of an ARC with this minimum runtime: more if it is short, as others wait less behind it."""
     return max(1, SCALE // math.isqrt(runtime))
 
 
@@ -252,9 +256,9 @@ class ConflictGroup:
         arcs: list[Arc],
         reserved: Reservations | None = None,
         plan: BindingPlan = NO_PLAN,
-        asked: int = 0,
+        awaiting_votes: int = 0,
     ) -> None:
-        """`asked`: bits of RCs that others may get by votes that are out."""
+        """`awaiting_votes`: bits of the RCs that open votes may give to others."""
         self.state, self.votes = state, state.votes
         now = state.now
         first = {arc.id for arc in arcs if reserved is not None and reserved.goes_first(arc)}
@@ -277,11 +281,11 @@ class ConflictGroup:
             for arc, key in zip(self.arcs, keys, strict=True)
         ]
         self.planned: int | None = None
-        """The set of the plan as bits of item numbers. None: as by name, the plan is not needed."""
+        """The planned set as bits of item numbers. None: there is no plan, as no ARC has patterns."""
         self.moves = False
-        """`priority` would end an ARC and start it on other RCs, perhaps of these: no set expresses that."""
-        self.waits = bool(self.mask & (plan.off_limits | asked))
-        """Votes are out on which its bindings depend, or who may have its RCs."""
+        """True if `priority` would restart an ARC on other RCs, perhaps of this group: no set expresses that."""
+        self.waits = bool(self.mask & (plan.off_limits | awaiting_votes))
+        """True while open votes decide about its bindings or its RCs."""
         if plan is not NO_PLAN:
             stay = (arc.id in plan.started if arc.hold is None else arc.id not in plan.ended for arc in self.arcs)
             self.planned = sum(1 << number for number, stays in enumerate(stay) if stays)
@@ -318,12 +322,12 @@ class ConflictGroup:
 
     @property
     def off_limits(self) -> int:
-        """Bits of the RCs that it may take while its votes are out."""
+        """Bits of the RCs that it may take once its votes are in."""
         waiting = (arc for arc in self.arcs if arc.patterns and arc.hold is None)
         return self.mask | union(alternatives(self.state, arc) for arc in waiting)
 
     def flickers(self, chosen: int) -> bool:
-        """Return True if the set would end what was granted at this instant, by another plan."""
+        """Return True if the set would end a hold that another plan granted at this instant."""
         holds = [arc.hold for arc in self.changes(chosen)[1]]
         return self.planned is not None and any(hold and hold.start == self.state.now for hold in holds)
 
@@ -346,7 +350,7 @@ class ConflictGroup:
             actions.start(arc)
 
     def _vetoes(self, rc: Rc) -> Iterator[int]:
-        """The vetoes of `rc` on these ARCs. Its other holders stay."""
+        """The vetoes of `rc` on these ARCs as bits of item numbers; its other holders stay."""
         for holders in self.votes.vetoed(rc.name):
             if all(self._may_hold(rc, arc) for arc in holders) and (nogood := self._bits(holders)):
                 yield nogood

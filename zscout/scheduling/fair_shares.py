@@ -7,7 +7,7 @@ are free, and operators' ARCs still go first.
 Charges halve in each half-life. A group's *share* is its charge over its weight. Groups are in order of share, smallest
 first; shares that differ little count as equal, and then the shorter minimum runtime goes first.
 
-`SchedulerState` reports holds and queued ARCs as they come and go, so a pass sums up nothing."""
+`SchedulerState` reports each hold and queued ARC as it comes and goes, so a pass has nothing to sum up."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ from zscout.config.scheduling_policy import FairShares
 from zscout.scheduling.model import QUANTUM, Arc, Rc
 from zscout.types import SECOND, ArcId, Need, Ns
 
-NEAR: Final = 0.01
-"""Shares that differ by less than this part,"""
-LITTLE: Final = 60.0
-"""or by less RC-seconds than this, count as equal."""
-FORGOTTEN: Final = 1.0
-"""RC-seconds: a group with less, and without counted holds or queued ARCs, is forgotten."""
+NEAR_RATIO: Final = 0.01
+"""Shares that differ by no more than this part of the greater count as equal,"""
+NEAR_RC_SECONDS: Final = 60.0
+"""and so do shares that differ by no more RC-seconds than this."""
+FORGOTTEN_RC_SECONDS: Final = 1.0
+"""A group with a smaller charge, and without charged holds or queued ARCs, is forgotten."""
 MAX_GROUPS: Final = 1_000
-"""Accounts kept; beyond, the smallest are forgotten,"""
-SWEEP: Final[Ns] = 60 * SECOND
-"""at most this often."""
+"""Groups kept; beyond, those with the smallest charges are forgotten."""
+SWEEP_INTERVAL: Final[Ns] = 60 * SECOND
+"""How often groups are forgotten."""
 
 
 @dataclass(slots=True)
@@ -40,7 +40,7 @@ class GroupAccount:
     at: Ns = 0
     rate: int = 0  # contended RCs of its holds
     waiting: int = 0  # queued ARCs
-    position: int = 0  # among the waiting groups as of the last ordering, from 0; groups with near shares have the same
+    position: int = 0  # among the waiting groups at the last ordering, from 0; groups with near shares have the same
 
 
 class FleetState(Protocol):
@@ -74,8 +74,8 @@ class Shares:
         return self._account(self.group(arc)).position
 
     def preferred(self, arc: Arc, holders: Iterable[Arc]) -> str:
-        """The group of the first holder that came while `arc` waited and outranked it by its group's share alone;
-        empty if none."""
+        """The group of the first holder that started while `arc` waited and outranked it only by its group's share;
+        empty if there is none."""
         for holder in holders:
             if holder.priority == arc.priority and holder.position < arc.position and holder.hold is not None:
                 shorter = (arc.request.min_runtime, arc.place) < (holder.request.min_runtime, holder.place)
@@ -84,11 +84,11 @@ class Shares:
         return ""
 
     def charged(self) -> dict[str, float]:
-        """By group: decayed RC-seconds, greatest first; without negligible ones."""
+        """By group: decayed RC-seconds, greatest first, negligible charges left out."""
         now = self._state.now
         found = {group: self._settle(account, now).charged for group, account in self._accounts.items()}
         most = sorted(found.items(), key=lambda item: (-item[1], item[0]))[:MAX_GROUPS]
-        return {group: had for group, had in most if had >= FORGOTTEN}
+        return {group: had for group, had in most if had >= FORGOTTEN_RC_SECONDS}
 
     def totals(self) -> dict[str, float]:
         """By group: RC-seconds charged in all, since the start or since the group was forgotten."""
@@ -105,7 +105,7 @@ class Shares:
         account = self._queued.get(group)
         if account is None:
             account = self._queued[group] = self._account(group)
-            self._next = self._state.now  # its place in the order is not known
+            self._next = self._state.now  # its position is not known yet
         account.waiting += by
         if not account.waiting:
             account.position = 0
@@ -114,8 +114,8 @@ class Shares:
             self._count(arc, by)
 
     def count_absent(self, rc: Rc, arcs: Iterable[Arc], by: int) -> None:
-        """Count the queued ARCs in (1) before `rc` joins, or out (-1) before it leaves, where it decides whether
-        they wait."""
+        """Count in (1) before `rc` joins, or out (-1) before it leaves, the queued ARCs whose other named RCs are all
+        present."""
         others = self._state.present & ~rc.bit
         for arc in arcs:
             if arc.named_mask & rc.bit and not arc.named_mask & ~rc.bit & ~others:
@@ -136,12 +136,12 @@ class Shares:
         return self._next if self._next > self._state.now else self._state.now + QUANTUM
 
     def order(self) -> bool:
-        """Order the waiting groups, once a quantum at most. True: a position has changed."""
+        """Order the waiting groups, at most once a quantum. Return True if a position has changed."""
         now = self._state.now
         if now < self._next:
             return False
         self._next = now + QUANTUM
-        if now >= self._swept + SWEEP:
+        if now >= self._swept + SWEEP_INTERVAL:
             self._swept = now
             self._forget(now)
         weights = self._policy.weights
@@ -151,7 +151,7 @@ class Shares:
         )
         position, first, changed = -1, -1.0, False
         for share, group in shares:
-            if position < 0 or share - first > max(LITTLE, NEAR * share):
+            if position < 0 or share - first > max(NEAR_RC_SECONDS, NEAR_RATIO * share):
                 position, first = position + 1, share
             account = self._queued[group]
             changed |= account.position != position
@@ -166,7 +166,7 @@ class Shares:
         }
         spare = len(self._accounts) - MAX_GROUPS
         for number, (group, had) in enumerate(sorted(idle.items(), key=lambda item: (item[1], item[0]))):
-            if had >= FORGOTTEN and number >= spare:
+            if had >= FORGOTTEN_RC_SECONDS and number >= spare:
                 break
             del self._accounts[group]
 
@@ -177,7 +177,7 @@ class Shares:
         return account
 
     def _settle(self, account: GroupAccount, now: Ns) -> GroupAccount:
-        """Bring the account up to now: the old charge decays, and so does the new one."""
+        """Bring the account up to date: its charge decays, and so does the charge added since."""
         passed = now - account.at
         if passed:
             account.at = now
@@ -188,12 +188,12 @@ class Shares:
         return account
 
     def _count(self, arc: Arc, by: int) -> None:
-        who = self.group(arc), arc.priority
+        waiter = self.group(arc), arc.priority
         for rc in self._state.rcs_in(arc.named_mask):
-            if _counts(self._waiting.setdefault(rc.bit, Counter()), who, by):
+            if _change_count(self._waiting.setdefault(rc.bit, Counter()), waiter, by):
                 self._charge_all(rc)
         for need in arc.patterns:
-            if _counts(self._patterns.setdefault(need, Counter()), who, by):
+            if _change_count(self._patterns.setdefault(need, Counter()), waiter, by):
                 for rc in self._state.matching(need):
                     self._charge_all(rc)
                 if not self._patterns[need]:
@@ -222,13 +222,13 @@ class Shares:
         )
 
 
-def _counts(waiting: Counter[tuple[str, int]], who: tuple[str, int], by: int) -> bool:
-    """Count `who`; True for the first or the last."""
-    waiting[who] += by
-    if waiting[who] == 0:
-        del waiting[who]
+def _change_count(waiting: Counter[tuple[str, int]], waiter: tuple[str, int], by: int) -> bool:
+    """Change the count of waiting ARCs of a group and priority. Return True if it begins or ends by this."""
+    waiting[waiter] += by
+    if waiting[waiter] == 0:
+        del waiting[waiter]
         return True
-    return by > 0 and waiting[who] == 1
+    return by > 0 and waiting[waiter] == 1
 
 
 def decayed(charged: float, passed: Ns, half_life: Ns) -> float:
@@ -238,5 +238,5 @@ def decayed(charged: float, passed: Ns, half_life: Ns) -> float:
 
 def _mean_life(passed: Ns, half_life: Ns) -> float:
     """The decayed RC-seconds of one RC in the last `passed` ns."""
-    # The integral of 2**(-t / half_life), by expm1: for short times the difference of two ones would be all noise.
+    # The integral of 2**(-t / half_life), by expm1: for short times, `1 - exp2(...)` would be all noise.
     return -half_life / SECOND / math.log(2) * math.expm1(-math.log(2) * passed / half_life)

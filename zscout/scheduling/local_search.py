@@ -11,11 +11,11 @@ from typing import Final
 from zscout.scheduling.packing import PackingProblem, numbers
 
 MAX_ITEMS: Final = 2_000
-"""Items searched, best ranks first; the others only fill gaps."""
+"""Items searched, best-ranked first; the others only fill gaps."""
 MAX_LEVELS: Final = 12
-"""Levels searched: a value has a digit for each, and large numbers are slow."""
+"""Levels searched: a value has a digit per level, and large numbers are slow."""
 TENURE: Final = 7
-"""Steps for which a moved item stays."""
+"""Steps for which a moved item stays where it is."""
 IDLE_FACTOR: Final = 40
 """The search ends after this many steps per item without gain."""
 
@@ -30,26 +30,26 @@ class LocalSearch:
         self.best_key = problem.key(self.best)
         self.steps = 0
         items = problem.items
-        looked_at = [
+        searched = [
             number
             for number, item in enumerate(items[:MAX_ITEMS])
             if item.level < MAX_LEVELS and item.mask and problem.allowed(number, 0)
         ]
-        self._needs: dict[int, tuple[int, ...]] = {number: tuple(numbers(items[number].mask)) for number in looked_at}
+        self._needs: dict[int, tuple[int, ...]] = {number: tuple(numbers(items[number].mask)) for number in searched}
         width = max((rcs[-1] + 1 for rcs in self._needs.values()), default=0)
         self._cover: list[list[int]] = [[] for _ in range(width)]
-        for number in looked_at:
+        for number in searched:
             if not items[number].past_min_runtime:
                 for rc in self._needs[number]:
                     self._cover[rc].append(number)
         self._level = [item.level for item in items]
         self._top = [max((problem.unit[number] for number in cover), default=0) for cover in self._cover]
-        """The most that each RC could be worth; 0 for nothing."""
-        self._may_all = not problem.running and not problem.vetoes
+        """By RC: the most that it could be worth; 0 where no item uses it."""
+        self._all_may_enter = not problem.running and not problem.vetoes
         self._moved = [-TENURE] * len(items)
         self._random = 1
         self._improved_at = 0
-        self._idle = IDLE_FACTOR * max(1, len(looked_at))
+        self._idle = IDLE_FACTOR * max(1, len(searched))
         self._adopt(self.best)
 
     @property
@@ -78,7 +78,7 @@ class LocalSearch:
         began = self.steps
         while self.steps - began < steps and not self.done:
             self.steps += 1
-            # A plain congruential generator: the same search everywhere, and quick.
+            # A plain congruential generator: quick, and the search is the same everywhere.
             self._random = (self._random * 6364136223846793005 + 1442695040888963407) & 0xFFFFFFFFFFFFFFFF
             incoming = self._pick(self._pool[(self._random >> 33) % len(self._pool)])
             if incoming >= 0:
@@ -97,7 +97,7 @@ class LocalSearch:
             self._adopt(completed)
 
     def _pick(self, rc: int) -> int:
-        """The item to force in at `rc`: the greatest gain, the longest unmoved of equals; -1 for none."""
+        """The item to force in at `rc`, by greatest gain, then longest unmoved; -1 for none."""
         worth, owner, moved, needs = self.problem.worth, self._owner, self._moved, self._needs
         aim = self.best_key[0] - self._value
         fresh = self.steps - TENURE
@@ -117,11 +117,11 @@ class LocalSearch:
                 continue
             if best >= 0 and (gain < best_gain or (gain == best_gain and last >= best_moved)):
                 continue
-            if self._may_all or self._may(number, out):
+            if self._all_may_enter or self._may_enter(number, out):
                 best, best_gain, best_moved = number, gain, last
         return best
 
-    def _may(self, number: int, out: list[int]) -> bool:
+    def _may_enter(self, number: int, out: list[int]) -> bool:
         problem, level = self.problem, self._level[number]
         for other in out:
             item = problem.items[other]
@@ -135,7 +135,7 @@ class LocalSearch:
         return problem.allowed(number, left)
 
     def _force(self, number: int) -> None:
-        """Put `number` in; conflicting items leave, and items that fit the gaps come in."""
+        """Put `number` in; conflicting items leave, and items that fit the gaps enter."""
         problem, owner, masks = self.problem, self._owner, self.problem.masks
         out = {owner[need] for need in self._needs[number]}
         out.discard(-1)

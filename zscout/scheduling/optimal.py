@@ -6,10 +6,11 @@ A pass:
 2. Find each group's best set, counting unknown votes as yes: by branch and bound where quick, else by CP-SAT if
    OR-tools is installed (the extra `optimal`), else by local search. With patterns, a group whose planned set is as
    good is left to step 5.
-3. Ask the unknown votes that the set needs; until they are in, the group is off limits. A veto rules out that set of
-   holders and every larger set: back to 2.
+3. Ask for the unknown votes that the set needs; until they are in, the group is off limits. A veto rules out that set
+   of holders and every larger set: back to 2.
 4. Take the set: preempt its victims, start its ARCs.
-5. Run a pass of `priority` over the rest: by name it starts none, and reports their reasons.
+5. Run a pass of `priority` over the rest, for ARCs with patterns and for the reasons to wait. It starts no ARC that
+   names all its RCs.
 
 A set's value is the vector of (ARC, RC) pairs in use by priority, highest first (`packing.py`). OR-tools is imported
 at first use, because it is large. The solver has a deterministic clock and one worker: the same problem always gives
@@ -33,17 +34,17 @@ if TYPE_CHECKING:
     from ortools.sat.python import cp_model
 
 SOLVER_BUDGET: Final = 0.3
-"""Deterministic time of all stages together: about half a second. Unused time passes to the next stage."""
-LEAST: Final = 0.01
-CHUNK: Final = 40
-"""Items whose ranks are weighed in one stage: their weights are powers of two."""
-WORK: Final = 200_000
-"""Steps of branch and bound times items before a group counts as large: some 20 ms. More seldom proves more."""
+"""Deterministic time of all stages together: about half a second. A stage leaves its unused time to the next."""
+MIN_STAGE_TIME: Final = 0.01
+RANKS_PER_STAGE: Final = 40
+"""Items whose ranks a stage weighs: their weights are powers of two."""
+PACKING_WORK: Final = 200_000
+"""The budget of a group for branch and bound, in steps times items: some 20 ms. More would seldom prove more."""
 MAX_PACKED: Final = 80
 """Larger groups skip branch and bound: at 30x60 it takes 11 ms and CP-SAT 18, at 40x80 it seldom finds a proof."""
-STEPS: Final = 6_000
+LOCAL_SEARCH_STEPS: Final = 6_000
 MAX_VETOES: Final = 256
-"""Vetoes on one group before `priority` decides it: a proof may need a question for each of very many sets."""
+"""After more vetoes on a group `priority` decides it: a proof may need a question for each of very many sets."""
 
 
 @functools.cache
@@ -55,7 +56,7 @@ def improve(problem: PackingProblem, start: int, budget: float = SOLVER_BUDGET) 
     """A feasible set at least as good as the feasible `start`; the best set, if time allows."""
     found = _Solver(problem, start, budget).solve()
     best = max((problem.complete(found), found), key=problem.key)
-    # Only a proof decides between sets of equal worth; otherwise the start stays.
+    # Without a proof, a set of equal worth doesn't replace the start.
     return best if problem.key(best) > problem.key(start) or best == found else start
 
 
@@ -85,16 +86,16 @@ class _Solver:
         kept = sum(take for item, take in zip(problem.items, takes, strict=True) if item.in_min_runtime)
         if not isinstance(kept, int) and not self._stage(kept):
             return self.found
-        for begin in range(0, len(takes), CHUNK):
-            chunk = takes[begin : begin + CHUNK]
+        for begin in range(0, len(takes), RANKS_PER_STAGE):
+            chunk = takes[begin : begin + RANKS_PER_STAGE]
             ranks = sum((1 << len(chunk) - 1 - at) * take for at, take in enumerate(chunk))
             if not self._stage(ranks):
                 return self.found
         return self.found
 
     def _stage(self, goal: Any) -> bool:
-        """Maximise `goal` and fix its value; False if not proven."""
-        if self.left < LEAST:
+        """Maximise `goal` and fix its value. Return False if it is not proven optimal."""
+        if self.left < MIN_STAGE_TIME:
             return False
         self.model.clear_hints()  # type: ignore[no-untyped-call]
         for number, take in enumerate(self.takes):
@@ -128,7 +129,8 @@ class _Solver:
             self.model.add_bool_or(~self.takes[number] for number in numbers(nogood))
 
     def _keep_running(self) -> None:
-        """Keep running items, unless a chosen item that outranks them conflicts, or all others of a veto do."""
+        """Keep each running item, unless a chosen item that outranks it needs its RCs, or a veto rules it out beside
+        chosen items that all outrank it."""
         problem = self.problem
         for running in problem.running:
             mask = problem.masks[running]
@@ -153,17 +155,17 @@ class Optimal(Strategy):
         plan = dry_run(state, None)
         decided = [(group, decide(group, actions)) for group in conflict_groups(state, plan=plan)]
         held, plan = take_all(state, None, plan, decided, actions)
-        # It starts none by name, but reports the reasons of waiting ARCs.
+        # It starts no ARC that names all its RCs, but reports the reasons to wait.
         priority.run_pass(state, actions, off_limits=held, plan=plan)
 
 
 def decide(group: ConflictGroup, actions: Actions) -> Decision:
-    """The best set of a group, where `priority` plans none that is as good."""
+    """The best set of a group, unless the set that `priority` plans is as good."""
     proposals = None
     while proposals is None:
         if group.moves or group.waits or len(group.nogoods) > MAX_VETOES:
             return "left"
-        # None: ruled out by a known veto; each round bars at least one more set.
+        # None: a known veto rules the set out; each round bars at least one more set.
         problem = group.problem()
         chosen = best(problem)
         if group.planned is not None and problem.key(chosen) <= problem.key(group.planned):
@@ -179,10 +181,10 @@ def decide(group: ConflictGroup, actions: Actions) -> Decision:
 def best(problem: PackingProblem) -> int:
     """The best set, or the best within the budget: at least as good as the heuristic's."""
     size = len(problem.items)
-    packing = pack(problem, WORK // max(1, size) if size <= MAX_PACKED else 0)
+    packing = pack(problem, PACKING_WORK // max(1, size) if size <= MAX_PACKED else 0)
     if packing.exact:
         return packing.chosen
     search = LocalSearch(problem, packing.chosen)
-    search.run(STEPS)
+    search.run(LOCAL_SEARCH_STEPS)
     found = max(packing.chosen, search.best, key=problem.key)
     return improve(problem, found) if solver_available() else found

@@ -18,9 +18,9 @@ NO_LIMIT = 1 << 60
 
 
 class PackingItem(NamedTuple):
-    """A contender: exclusive RCs as a mask, RCs in all, level (0 is the highest), whether it runs.
+    """An ARC: `mask` of its exclusive RCs, `width` in RCs of both kinds, level (0 is the highest).
 
-    `past_min_runtime`: worth nothing, and may have to end for its own level too, but for no lower one."""
+    `past_min_runtime`: worth nothing, and may have to end for its own level too, but for no lower level."""
 
     mask: int
     width: int
@@ -28,7 +28,7 @@ class PackingItem(NamedTuple):
     running: bool = False
     past_min_runtime: bool = False
     density: int = 1
-    """The worth of each of its RCs among those of its level."""
+    """The worth of each of its RCs, compared within its level."""
 
     @property
     def in_min_runtime(self) -> bool:
@@ -45,7 +45,7 @@ class Packing:
 
 
 class PackingProblem:
-    """Items in rank order, so levels never fall; `nogoods`: item sets that must not be chosen together.
+    """Items in rank order, so levels never decrease; `nogoods`: item sets that must not be chosen together.
 
     All running items fit together, except as vetoed."""
 
@@ -75,7 +75,7 @@ class PackingProblem:
         return all(nogood & ~beside for nogood in self.nogoods[number])
 
     def upper_bound(self, open_: Iterable[int]) -> int:
-        """The most that these items can be worth together. Levels must not fall."""
+        """The most that these items can be worth together; their levels must not decrease."""
         masks, units = self.masks, self.unit
         if self.plain:
             layer = 0
@@ -106,8 +106,8 @@ class PackingProblem:
         return self.value(chosen), -sum(item.in_min_runtime for item in left_out)
 
     def complete(self, preferred: int = 0) -> int:
-        """A maximal feasible set: level by level the running items, the preferred, the rest by rank. Without
-        `preferred` it is the heuristic's."""
+        """A maximal feasible set: level by level the running items, the `preferred`, then the rest by rank. Without
+        `preferred` it is the heuristic's set."""
         items, masks = self.items, self.masks
 
         def order(number: int) -> tuple[int, int]:
@@ -153,7 +153,7 @@ class _BranchAndBound:
         self.problem = problem
         self.limit = nodes
         items = problem.items
-        # These stay wherever they fit. Other running items are decided by rank, and the whole set is checked.
+        # Running items that stay wherever they fit. The others are decided by rank, and the whole set is checked.
         self.always_kept = [
             item.in_min_runtime and not nogoods for item, nogoods in zip(items, problem.nogoods, strict=True)
         ]
@@ -181,9 +181,8 @@ class _BranchAndBound:
     def _descend(
         self, todo: list[tuple[list[int], int, int, int]], open_: list[int], chosen: int, value: int, preemptions: int
     ) -> bool:
-        """Take the first items down to a complete set; alternatives go to `todo`. `open_` are allowed beside `chosen`.
-
-        True: the limit left sets unseen."""
+        """Take first items until the set is complete; alternatives go to `todo`. All `open_` are allowed beside
+        `chosen`. Return True if the limit left sets unseen."""
         problem, masks, worth = self.problem, self.problem.masks, self.problem.worth
         while open_:
             self.nodes += 1
