@@ -15,7 +15,13 @@ from zscout.config.scheduling_policy import PATIENCE, SchedulingPolicy, Strategy
 from zscout.scheduling.core import Core
 from zscout.scheduling.forecast import forecast
 from zscout.scheduling.model import ArcRequest, HoldEnded, LeadTaken, Outcome, RcJoined, Requested, Tick
-from zscout.scheduling.patience import KEPT, LONGEST, MOST, RUNTIMES, RuntimeMean
+from zscout.scheduling.patience import (
+    GRANTS_PER_OWNER,
+    MAX_COUNTED_RUNTIME,
+    MAX_PATIENCE,
+    PATIENCE_IN_RUNTIMES,
+    RuntimeMean,
+)
 from zscout.scheduling.strategies import STRATEGIES
 from zscout.simulation.replay import replay
 from zscout.types import SECOND, ArcId, Need, Ns, Params, Term
@@ -197,37 +203,39 @@ def test_patience_follows_the_minimum_runtimes_that_are_granted() -> None:
     hour = 3_600 * SECOND
     assert reckoned() == PATIENCE
     assert reckoned(("a", SECOND)) == PATIENCE
-    assert reckoned(("a", 600 * SECOND), ("a", 1_200 * SECOND)) == RUNTIMES * 900 * SECOND
-    assert reckoned(("a", 600 * SECOND), ("b", 1_200 * SECOND)) == RUNTIMES * 600 * SECOND, "of two the shorter"
-    assert reckoned(("a", 100 * hour)) == MOST
-    assert reckoned(("a", 100 * LONGEST), *[("a", SECOND)] * 9) == min(
-        MOST, round(RUNTIMES * (LONGEST + 9 * SECOND) / 10)
+    assert reckoned(("a", 600 * SECOND), ("a", 1_200 * SECOND)) == PATIENCE_IN_RUNTIMES * 900 * SECOND
+    assert reckoned(("a", 600 * SECOND), ("b", 1_200 * SECOND)) == PATIENCE_IN_RUNTIMES * 600 * SECOND, (
+        "of two the shorter"
+    )
+    assert reckoned(("a", 100 * hour)) == MAX_PATIENCE
+    assert reckoned(("a", 100 * MAX_COUNTED_RUNTIME), *[("a", SECOND)] * 9) == min(
+        MAX_PATIENCE, round(PATIENCE_IN_RUNTIMES * (MAX_COUNTED_RUNTIME + 9 * SECOND) / 10)
     )
 
 
 def test_one_owner_does_not_move_the_patience() -> None:
     others = [(name, runtime * SECOND) for name, runtime in (("a", 300), ("b", 400), ("c", 500)) for _ in range(9)]
-    for runtime in (SECOND, LONGEST):
+    for runtime in (SECOND, MAX_COUNTED_RUNTIME):
         moved = reckoned(*others, *[("greedy", runtime)] * 10_000)
-        assert RUNTIMES * 300 * SECOND <= moved <= RUNTIMES * 500 * SECOND
+        assert PATIENCE_IN_RUNTIMES * 300 * SECOND <= moved <= PATIENCE_IN_RUNTIMES * 500 * SECOND
 
 
 def test_the_patience_of_the_leader_before_counts_less_and_less() -> None:
     before = 4 * 3_600 * SECOND
     assert reckoned(before=before) == before
-    few, many = (reckoned(*[("a", 10 * SECOND)] * count, before=before) for count in (10, KEPT))
-    assert before > few > many == RUNTIMES * 10 * SECOND
+    few, many = (reckoned(*[("a", 10 * SECOND)] * count, before=before) for count in (10, GRANTS_PER_OWNER))
+    assert before > few > many == PATIENCE_IN_RUNTIMES * 10 * SECOND
 
 
 def test_it_is_fixed_when_an_arc_is_queued() -> None:
     core = fleet(SchedulingPolicy())
     at(core, 0, ask("long", seconds=1_000))
     at(core, 61, ask("waits"))
-    assert core._state.queued["waits"].patience == core.patience == RUNTIMES * 1_000 * SECOND
+    assert core._state.queued["waits"].patience == core.patience == PATIENCE_IN_RUNTIMES * 1_000 * SECOND
     at(core, 62, *(ask(f"n{number}", 1, 1, "b") for number in range(3)))
     at(core, 200)
-    assert core.patience < RUNTIMES * 1_000 * SECOND
-    assert core._state.queued["waits"].patience == RUNTIMES * 1_000 * SECOND
+    assert core.patience < PATIENCE_IN_RUNTIMES * 1_000 * SECOND
+    assert core._state.queued["waits"].patience == PATIENCE_IN_RUNTIMES * 1_000 * SECOND
 
 
 def test_a_number_in_the_fleet_file_stands() -> None:

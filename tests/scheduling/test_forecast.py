@@ -184,7 +184,7 @@ def test_dates_that_the_copy_gets_as_they_come_near_change_nothing(
             new = ArcRequest(f"a{now}", "h/c", wanted, draw.randint(0, 2), draw.randint(1, 20), draw.random() < 0.2)
             found = forecast(core, now, new)
             with monkeypatch.context() as patched:
-                patched.setattr(forecasts, "NEAR", 10**6)
+                patched.setattr(forecasts, "LOOKAHEAD", 10**6)
                 assert forecast(core, now, new) == found, (seed, now)
             chain_of(core, now, Requested(new))
             asked, foretold = asked + 1, foretold + len(found.starts)

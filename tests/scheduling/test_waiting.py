@@ -167,9 +167,9 @@ def test_nobody_waits_longer_than_promised_beside_protected_holds_of_lower_prior
 def test_nobody_waits_longer_than_promised_where_patience_follows_the_runtimes(
     seeds: Sequence[int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(patience, "RUNTIMES", 2)
+    monkeypatch.setattr(patience, "PATIENCE_IN_RUNTIMES", 2)
     monkeypatch.setattr(patience, "PATIENCE", SECOND)
-    monkeypatch.setattr(patience, "EVERY", SECOND)
+    monkeypatch.setattr(patience, "UPDATE_INTERVAL", SECOND)
     tried, different = 0, 0
     for seed in seeds:
         work, known = of_classes(seed), dict[ArcId, Ns]()

@@ -240,7 +240,7 @@ def judge_bindings(
         blamed = _blamed(state, arc, verdict, off_limits)
         if best is None or not blamed:
             best = arc.bound, verdict
-        # A planned binding waits for the votes of others: another one might be in the way of a lower rank.
+        # A planned binding waits for the votes of others: a different binding might be in the way of a lower rank.
         if not blamed or (is_planned and verdict == "off limits"):
             break
         without |= blamed

@@ -1,8 +1,8 @@
-"""Forecast of starts: a copy of the core played forward, as if no further event were to come.
+"""Forecast of starts: a copy of the core is played forward, as if no further event came.
 
-RCs vote as they have voted, and unknown votes count as yes. Later requests of higher priority and early releases
-make it wrong: it is an estimate. Bookings are taken up at their dates, or lapse where the date is over; maintenance
-lasts as planned."""
+It is an estimate: later requests of higher priority and early releases make it wrong. RCs vote as they have voted, and
+unknown votes count as yes. Bookings are taken up at their dates, or lapse if the date is over; maintenance lasts as
+planned."""
 
 from __future__ import annotations
 
@@ -23,19 +23,19 @@ from zscout.scheduling.strategies import STRATEGIES
 from zscout.types import ArcId, Ns, Term
 
 MAX_CHECKS = 4_000
-"""Queued ARCs, summed over all instants: bounds the time that the RCM spends."""
-DATE_CHECKS = 20
-"""A date that begins costs as much as checks of so many queued ARCs."""
-NEAR = 4
-"""Open bookings are entered in a forecast this many times the longest runtime ahead, at least 2."""
+"""Checks of queued ARCs in a forecast, summed over its instants: bounds the time that the RCM spends."""
+CHECKS_PER_DATE = 20
+"""A date that begins costs as much as this many checks."""
+LOOKAHEAD = 4
+"""Open bookings are entered this many longest runtimes ahead (at least 2)."""
 MAX_WAITING = 1_000
-"""Queued ARCs of a forecast: the best-ranked."""
+"""Queued ARCs in a forecast, best-ranked first."""
 
 
 def play_instant(
     core: Core, now: Ns, events: Iterable[Event], vote: Callable[[Propose], model.Vote]
 ) -> Iterator[list[Effect]]:
-    """One instant, with all its votes and further passes; yields the effects of each batch."""
+    """Play one instant, with all its votes and further passes. Yields the effects of each batch."""
     batch = list(events)
     while batch:
         effects = core.handle(now, *batch)
@@ -48,7 +48,7 @@ def play_instant(
 @dataclass(slots=True)
 class Forecast:
     starts: dict[ArcId, Ns] = field(default_factory=dict)
-    """A missing ARC never starts from the present state, or not within the forecast."""
+    """A missing ARC does not start within the forecast, or never from the present state."""
     preempts: list[ArcId] = field(default_factory=list)
     begin_within: Ns = 0
     """The longest time that the newcomer's devices need to begin."""
@@ -58,7 +58,7 @@ class Forecast:
 def forecast(
     core: Core, now: Ns, newcomer: ArcRequest | None = None, runtimes: RuntimeEstimator | None = None
 ) -> Forecast:
-    """Play a copy of `core` forward from `now`, with `newcomer` asking at once. With `runtimes` holds end when they
+    """Play a copy of `core` forward from `now`, where `newcomer` enters first. With `runtimes`, holds end when they
     usually do."""
     # A copy, as a strategy may keep unfinished searches.
     copy = Core(STRATEGIES[core.strategy.name](), core.policy, assume_latest_begin=True)
@@ -69,16 +69,16 @@ def forecast(
     result = Forecast()
     ends = {held.request.arc: held.end for held in lead.recovered_holds}
     releases: dict[ArcId, Ns] = {}  # likely times of release
-    asked = [held.request for held in lead.recovered_holds] + [queued.request for queued in lead.waiting]
-    asked += [newcomer] if newcomer is not None else []
-    runtimes_of = [request.min_runtime for request in asked] + [
+    requests = [held.request for held in lead.recovered_holds] + [queued.request for queued in lead.waiting]
+    requests += [newcomer] if newcomer is not None else []
+    runtimes_of = [request.min_runtime for request in requests] + [
         booking.runtime for booking, _ in booked.values() if not booking.maintenance
     ]
-    coming = _Coming(later.values(), max(runtimes_of, default=0))
+    coming = _ComingBookings(later.values(), max(runtimes_of, default=0))
     dates = sorted(
         (at, name) for name, (booking, is_open) in booked.items() for at in _dates(booking, now, is_open=is_open)
     )
-    # What follows maintenance without an end is not known.
+    # Nothing is known about the time after maintenance without an end.
     unknown = min((booking.end for booking, _ in booked.values() if booking.until is None), default=math.inf)
     unserved = {queued.request.arc for queued in lead.waiting}  # queued ARCs that have not started within the forecast
 
@@ -87,8 +87,8 @@ def forecast(
         if end is not None:
             releases[request.arc] = end
 
-    def vote(asked: Propose) -> model.Vote:
-        return model.Vote(asked.proposal, core.expects_yes(asked.rc, frozenset(asked.holders)))
+    def vote(proposal: Propose) -> model.Vote:
+        return model.Vote(proposal.proposal, core.expects_yes(proposal.rc, frozenset(proposal.holders)))
 
     def step(events: list[Event], preempting: ArcId | None = None) -> None:
         for effect in itertools.chain.from_iterable(play_instant(copy, now, events, vote)):
@@ -141,17 +141,17 @@ def forecast(
             booking, is_open = booked[name]
             if is_open and date == booking.start and not booking.maintenance:
                 events.append(model.Requested(request_for(booking)))
-                checks += DATE_CHECKS
+                checks += CHECKS_PER_DATE
         step(events)
     return result
 
 
-class _Coming:
-    """Open bookings that the copy does not know yet: it gets them as they come near, so that a forecast of the next
-    hours costs no copy of a year.
+class _ComingBookings:
+    """Open bookings that the copy does not know yet. It gets them as they come near, so that a forecast of hours need
+    not copy the bookings of a year.
 
-    Whatever starts now is over within `reach`, the longest runtime. A reservation that an unknown booking would move
-    begins later than that: it holds nothing back that starts now."""
+    Every ARC that starts now ends within `reach`, the longest runtime. Reservations that an unknown booking would move
+    begin later, so they hold back none of these ARCs."""
 
     def __init__(self, bookings: Iterable[Booking], reach: Ns) -> None:
         self._left = deque(sorted(bookings, key=lambda booking: (booking.start, booking.id)))
@@ -159,9 +159,9 @@ class _Coming:
         self._known_until: Ns = 0
 
     def until(self, now: Ns) -> list[Event]:
-        """Those that the copy has to know from now on."""
+        """The events for the bookings that the copy must know from now on."""
         if now + 2 * self._reach > self._known_until:
-            self._known_until = now + NEAR * self._reach
+            self._known_until = now + LOOKAHEAD * self._reach
         near = list[Event]()
         while self._left and self._left[0].start <= self._known_until:
             near.append(Booked(self._left.popleft()))

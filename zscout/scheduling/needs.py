@@ -21,12 +21,12 @@ def check_request(name: str, needs: Mapping[Need, Params], min_runtime: Ns) -> N
 
 def check_patterns(needs: Mapping[Need, Params]) -> None:
     """Raises ValueError for an invalid pattern (BadName), and where parameters would depend on the choice of RCs."""
-    asked: dict[str, Params] = {}
+    by_kind: dict[str, Params] = {}
     for need, params in needs.items():
         if not is_pattern(need):
             continue
         kind = check_need(need).partition("/")[0]
-        if asked.setdefault(kind, params) != params:
+        if by_kind.setdefault(kind, params) != params:
             raise ValueError(f"patterns of the kind {kind} have different parameters; give them all the same")
-    if asked and any(map(is_pattern, asked)) and any(asked.values()):
+    if by_kind and any(map(is_pattern, by_kind)) and any(by_kind.values()):
         raise ValueError("a pattern for devices of any kind can't be combined with parameters; name a kind")

@@ -4,15 +4,15 @@ While an ARC waits, each check *binds* its patterns to separate RCs, the best at
 other, so every strategy supports patterns. Where a bound RC keeps the ARC out, the check tries the next best. A hold
 keeps its binding to its end.
 
-The worst of an ARC's choices counts (`Fitness`): the binding without the worse kind wins, found by augmenting paths
-(Kuhn's algorithm), so an ARC never waits where some choice of free RCs would let it run. Ties: the RC kept for the
-ARC's booking, then the RC that nobody waits for by name, or those of the lowest rank (`Rc.wanted`). Of sharable RCs:
-the RC of the ARC that it continues, then the fewest holders. The bindings of a pass are found together (`plan.py`).
+Bindings are compared by the worst RC in them (`Fitness`). The best one is found by augmenting paths (Kuhn's algorithm),
+so an ARC never waits where some choice of free RCs would let it run. Ties: the RC kept for the ARC's booking, then the
+RC least wanted by ARCs that name it (`Rc.wanted`). Ties of sharable RCs: the RC of the ARC that it continues, then the
+RC with the fewest holders. The bindings of a pass are found together (`plan.py`).
 
 Where holds have to end, the fewest and lowest-ranked do (`_least_ending`). Holders of named exclusive RCs end anyway,
 so their other RCs count as free.
 
-`optimal` is exact for the binding of the instant; it does not search all bindings of all ARCs."""
+`optimal` is exact for the bindings of the instant; it does not search all bindings of all ARCs."""
 
 from __future__ import annotations
 
@@ -32,26 +32,26 @@ from zscout.types import Need, Ns, RcName
 
 
 class Fitness(IntEnum):
-    """How well an RC would do, the best first."""
+    """How well an RC suits an ARC, best first."""
 
     FREE = 0
     FREED = 1
     """Its holder ends for the ARC anyway."""
     CLAIMED = 2
-    """Bound already to a higher rank in this pass."""
+    """Already bound to a higher rank in this pass."""
     PREEMPTIBLE = 3
     RESERVED = 4
     """Reserved for another, or unresponsive with an unknown vote."""
     HELD = 5
-    """Its holder stays, or it has refused."""
+    """Its holder stays, or it has refused the ARC."""
 
 
 MAX_TRIED: Final = 200
-"""Choices tried to minimise victims."""
+"""Choices tried to find the fewest victims."""
 
 
 class _Choice(NamedTuple):
-    """An RC for a pattern. The least is the best."""
+    """An RC for a pattern, in order of preference."""
 
     fitness: Fitness
     tie: tuple[float, ...]
@@ -77,11 +77,12 @@ class Choices:
         ]
         self._best_first.sort()
         self.contended = union(choice.bit for choice in self._best_first if choice.fitness <= Fitness.PREEMPTIBLE)
-        """RCs of which it matters whether they are claimed."""
+        """Bits of the RCs for which claims by others matter."""
         self._found: dict[tuple[int, int], Mapping[Need, RcName] | None] = {}
 
     def best(self, *, without: int = 0, claimed: int = 0) -> Mapping[Need, RcName] | None:
-        """The best RCs outside `without`, where `claimed` RCs are bound to others (bit masks). None: no binding."""
+        """The best binding outside `without`, where the `claimed` RCs are bound to others (bit masks); None: there is
+        none."""
         key = without, claimed & self.contended
         if key not in self._found:
             self._found[key] = self._bind(*key)
@@ -130,7 +131,7 @@ def _count(best_first: Sequence[_Choice], worst: Fitness) -> int:
 
 
 def choices(state: SchedulerState, arc: Arc, reserved: Reservations | None) -> Choices:
-    """The choices of a queued ARC with patterns: those of its class, unless votes or its booking matter."""
+    """The choices of a queued ARC with patterns; shared by its class, unless votes or bookings matter."""
     like, reserved_bits = class_of(arc), 0 if reserved is None else usable(state, arc) & reserved.bits
     closed = union(rc.bit for rc in state.rcs_in(reserved_bits) if reserved is not None and reserved.reserves(rc, arc))
     if not _are_shared(state, arc):
@@ -145,7 +146,7 @@ def choices(state: SchedulerState, arc: Arc, reserved: Reservations | None) -> C
 
 
 def _are_shared(state: SchedulerState, arc: Arc) -> bool:
-    """Whether members of its class have the same choices where the same RCs are reserved for others."""
+    """Return True if members of its class with the same RCs reserved for others have the same choices."""
     matters = (class_of(arc).reach | arc.named_mask) & state.sharable
     return not matters and not usable(state, arc) & state.dates.claimed
 
@@ -157,14 +158,14 @@ def class_of(arc: Arc) -> PatternClass:
 
 
 def bind(state: SchedulerState, arc: Arc, reserved: Reservations | None) -> bool:
-    """Bind a queued ARC to its best RCs. False: no binding exists."""
+    """Bind a queued ARC to its best RCs. Return False if no binding exists."""
     bound = choices(state, arc, reserved).best()
     state.bind(arc, bound or {})
     return bound is not None
 
 
 def usable(state: SchedulerState, arc: Arc) -> int:
-    """Bits of the RCs that match, are present and not held without preemption, apart from sharable ones."""
+    """Bits of the matching RCs that are open to the ARC and, if exclusive, free or preemptible."""
     like = class_of(arc)
     if like.usable_of != state.version:
         like.usable_of, like.usable = state.version, like.reach & state.open_to(arc.priority)
@@ -179,13 +180,13 @@ def usable(state: SchedulerState, arc: Arc) -> int:
 
 
 def short(state: SchedulerState, arc: Arc) -> bool:
-    """Return True if too few RCs are usable, whatever is bound."""
+    """Return True if too few RCs are usable for any binding."""
     usable(state, arc)
     return class_of(arc).short
 
 
 def alternatives(state: SchedulerState, arc: Arc) -> int:
-    """Bits of the sharable RCs that its patterns may be bound to instead, where one is bound to a sharable RC."""
+    """Bits of the sharable RCs that may replace a sharable RC bound to its patterns."""
     masks = class_of(arc).masks
     return union(masks[need] & state.sharable for need, rc in arc.bound.items() if state.rc(rc).sharable)
 
@@ -221,7 +222,7 @@ def enough(masks: Iterable[int]) -> bool:
 def _fitness(
     state: SchedulerState, arc: Arc, rc: Rc, closed: bool, ending: Collection[Arc]
 ) -> tuple[Fitness, tuple[float, ...]]:
-    """The fitness of `rc` where the holders `ending` end anyway, and a tie-breaker. `closed`: reserved for another."""
+    """The fitness of `rc` and a tie-breaker. `closed`: reserved for another; `ending`: holders that end anyway."""
     non_preemptible = rc.non_preemptible_holders(arc, state.now)
     kept = arc.claim is not None and bool(rc.bit & arc.claim.kept)
     if rc.sharable:
@@ -231,9 +232,9 @@ def _fitness(
         if answer is not None and not answer.accept:
             return Fitness.HELD, rc.wanted
         # The ARC that it continues ends for it; its device continues only on the same RC.
-        asked = arc.request
-        continues_here = bool(asked.continues) and any(
-            asked.continues_from(holder.request) for holder in rc.holders.values()
+        request = arc.request
+        continues_here = bool(request.continues) and any(
+            request.continues_from(holder.request) for holder in rc.holders.values()
         )
         return Fitness.FREE, (-1 if continues_here or kept else len(rc.holders) + (answer is None),)
     if non_preemptible:
@@ -255,7 +256,7 @@ def _exclusive_victims(state: SchedulerState, arc: Arc, mask: int) -> Iterator[A
 
 
 def _victims(state: SchedulerState, arc: Arc, mask: int) -> set[Arc]:
-    """The victims if `arc` starts with these RCs, by steps 3b and 3c of `priority`. Unknown votes count as yes: they
+    """The victims if `arc` starts with these RCs, by steps 3b and 3c of `priority`. Unknown votes count as yes, as RCs
     are asked before a preemption."""
     ending = set(_exclusive_victims(state, arc, mask))
     sharables, now = list(state.rcs_in(mask & state.sharable)), state.now
@@ -275,9 +276,9 @@ def _victims(state: SchedulerState, arc: Arc, mask: int) -> set[Arc]:
 def _least_ending(
     state: SchedulerState, arc: Arc, start: dict[Need, Rc], best_first: Sequence[_Choice], there: int, claimed: int
 ) -> dict[Need, Rc]:
-    """Separate RCs for all needs, none of `claimed`, with the fewest victims: first within their minimum runtimes,
-    then of all, then the lowest-ranked. Branch and bound from `start`, the best of MAX_TRIED choices. `there`: bits of
-    all RCs that could be chosen."""
+    """Separate RCs for all needs, none of `claimed`, with the fewest victims: first of victims within their minimum
+    runtimes, then of all, then the lowest-ranked. Branch and bound from `start`, over MAX_TRIED choices at most.
+    `there`: bits of all RCs that could be chosen."""
     if not arc.named_mask & state.sharable and not any(rc.holders for rc in start.values()):
         return start
     now, best = state.now, start
@@ -318,9 +319,9 @@ def _ranks(arcs: Iterable[Arc]) -> list[Rank]:
 
 def bind_all(state: SchedulerState, reserved: Reservations | None = None, claimed: int = 0) -> None:
     """Find bindings of all queued ARCs with patterns (`PatternClass.bound`), best-ranked first, to different RCs as
-    far as possible, and to others than the `claimed`. Once a class claims no more, its other members have the same,
-    until others claim what it may have."""
-    asleep = dict[PatternClass, int]()  # with the RCs of which it matters whether they are claimed
+    far as possible, and to others than the `claimed`. Once the claims of a class no longer change its choices, its
+    other members get the same binding, until other classes claim RCs that matter to it."""
+    asleep = dict[PatternClass, int]()  # such classes, with bits of the RCs that matter
     heap = [(like.members[0], number, like) for number, like in enumerate(state.classes.values())]
     numbers = {like: number for _, number, like in heap}
     heapq.heapify(heap)
@@ -349,14 +350,14 @@ def bind_all(state: SchedulerState, reserved: Reservations | None = None, claime
 def no_match(state: SchedulerState, arc: Arc) -> Reason:
     to = state.open_to(arc.priority)
     there = {need: state.matching_mask(need) & to for need in arc.patterns}
-    # Patterns without any RC; else all, as there are too few for all.
+    # The patterns without any RC; else all patterns, as there are too few RCs for them together.
     short = sorted(need for need, mask in there.items() if not mask) or sorted(there)
     lost = [rc for mask in map(state.matching_mask, short) for rc in state.rcs_in(mask & ~to)]
     return of_rcs(ReasonCode.NO_MATCH, short, absences(dict.fromkeys(lost)))
 
 
 def distinct(allowed: dict[Need, list[Rc]]) -> dict[Need, Rc] | None:
-    """Separate RCs for all needs, each the best that leaves one for the others; None: impossible."""
+    """Separate RCs for all needs, each the best that leaves RCs for the others; None: impossible."""
     if (chosen := _apart(allowed)) is not None:
         return chosen
     owner: dict[int, Need] = {}
@@ -379,7 +380,8 @@ def distinct(allowed: dict[Need, list[Rc]]) -> dict[Need, Rc] | None:
 
 
 def _apart(allowed: dict[Need, list[Rc]]) -> dict[Need, Rc] | None:
-    """As `distinct` chooses where needs have the same RCs or none in common; None: elsewhere, or impossible."""
+    """The choice of `distinct`, if any two needs have the same RCs or none in common; None: they don't, or it is
+    impossible."""
     lists = {id(rcs): rcs for rcs in allowed.values()}
     seen = 0
     for rcs in lists.values() if len(lists) > 1 else ():
@@ -392,5 +394,5 @@ def _apart(allowed: dict[Need, list[Rc]]) -> dict[Need, Rc] | None:
         needs.setdefault(id(allowed[need]), []).append(need)
     if any(len(lists[key]) < len(some) for key, some in needs.items()):
         return None
-    # The last to be placed takes the best, and the others move up.
+    # As in `distinct`, the need placed last takes the best RC, and the earlier ones move up.
     return {need: rc for key, some in needs.items() for need, rc in zip(some, lists[key], strict=False)}

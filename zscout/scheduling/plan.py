@@ -1,13 +1,13 @@
 """A dry run of `priority` by its steps, for the bindings of a pass: unknown votes count as yes, and nothing changes.
 
-ARCs with patterns that start in the run may still be bound otherwise. Where exclusive RCs that these have keep a lower
-rank out, they are bound anew along augmenting paths (Kuhn's algorithm), to RCs that are free or were freed in this run.
-So no ARC waits where some bindings of those that start would let it: in rank order, which of ARCs with one need each
-gives the lexicographically best set (a transversal matroid). Running ARCs never move, and no hold ends for a path but
-those that end for the ARC itself.
+ARCs with patterns that start in the run may still move to other RCs. If their exclusive RCs keep a lower rank out, they
+are rebound along augmenting paths (Kuhn's algorithm), to RCs that are free or were freed in this run. So no ARC waits
+if other bindings of the starting ARCs would let it start; for ARCs with one need each, taken in rank order, this gives
+the lexicographically best set (a transversal matroid). Running ARCs never move, and a path ends only holds that end for
+the ARC itself.
 
-The pass itself tries each ARC's planned binding first, by the usual rules. What was planned on a vote that is not known
-waits for it, where another answer could change a binding."""
+The pass itself tries each ARC's planned binding first, by the usual rules. A binding planned on an unknown vote waits
+for it, if another answer could change a binding."""
 
 from __future__ import annotations
 
@@ -30,19 +30,19 @@ MAX_PATHS: Final = 200
 """Searches for paths in a run."""
 
 _versions = itertools.count(-2, -1)
-"""Of the states of dry runs: what is cached of these never serves the real ones."""
+"""Versions of the state in dry runs: negative, so that results cached in a dry run never serve a real state."""
 
 
 class BindingPlan(NamedTuple):
-    bound: Mapping[ArcId, Mapping[Need, RcName]] = {}  # of the ARCs with patterns that start
+    bound: Mapping[ArcId, Mapping[Need, RcName]] = {}  # by ARC with patterns that starts
     started: Set[ArcId] = frozenset()
-    ended: Set[ArcId] = frozenset()  # running ARCs; some start on other RCs
-    dropped: Set[ArcId] = frozenset()  # those granted at this instant, or given to start, that others may end
-    mask: int = 0  # bits of the RCs of those that start,
-    moved: int = 0  # and of those of them that end before, on other RCs
+    ended: Set[ArcId] = frozenset()  # running ARCs; some restart on other RCs
+    dropped: Set[ArcId] = frozenset()  # ARCs granted at this instant, or in `starting`, that others may end
+    mask: int = 0  # bits of the RCs of all `started`
+    moved: int = 0  # bits of the RCs of ARCs in both `started` and `ended`
     unknown: Sequence[tuple[Rc, HolderSet]] = ()  # the votes counted as yes on which bindings may depend
-    off_limits: int = 0  # bits of the RCs that wait for these votes,
-    since: Rank | None = None  # for this rank and those below
+    off_limits: int = 0  # bits of the RCs that wait for the `unknown` votes,
+    since: Rank | None = None  # closed to this rank and lower ranks
 
 
 NO_PLAN: Final = BindingPlan()
@@ -51,7 +51,7 @@ NO_PLAN: Final = BindingPlan()
 def dry_run(
     state: SchedulerState, reserved: Reservations | None, starting: Iterable[Arc] = (), ending: Iterable[Arc] = ()
 ) -> BindingPlan:
-    """What a pass of `priority` would do; first these end and start. NO_PLAN where no ARC has a pattern."""
+    """The plan of a pass of `priority` that follows these starts and ends; NO_PLAN if no ARC has a pattern."""
     by_pattern = state.by_pattern or state.running_by_pattern
     return _DryRun(state, reserved).play(starting, ending) if by_pattern else NO_PLAN
 
@@ -65,12 +65,12 @@ class _DryRun:
         self._holders: dict[int, dict[ArcId, Arc]] = {}  # by bit: as before the run
         self._heap: list[tuple[Rank, int, Arc, Watched | None]] = []
         self._walked: set[Watched] = set()
-        self._movable = 0  # bits of the exclusive RCs by pattern of those that started
+        self._movable = 0  # bits of the exclusive RCs that started ARCs have by pattern
         self._paths = 0
         self._failed: dict[PatternClass, int] = {}  # by class: the version in which a member found no path
-        self._may_end: dict[int, bool] = {}  # by priority: whether some hold may end for it
+        self._may_end: dict[int, bool] = {}  # by priority: True if some hold may end for it
         self._presumed: dict[ArcId, tuple[int, list[tuple[Rc, HolderSet]]]] = {}
-        """By ARC: the votes that were counted as yes when it started, and bits of the RCs that it takes and frees."""
+        """By started ARC: bits of the RCs that it takes and frees, and the votes counted as yes for it."""
 
     def play(self, starting: Iterable[Arc], ending: Iterable[Arc]) -> BindingPlan:
         state = self.state
@@ -100,7 +100,7 @@ class _DryRun:
             state.running_by_owner, state.held_by_owner = owners
 
     def _depends(self) -> dict[str, Any]:
-        """The presumed votes on which a binding may depend, and bits of all RCs that these may bring to others."""
+        """The plan's fields for presumed votes on which bindings may depend, and bits of the RCs that these decide."""
         exclusive, started = ~self.state.sharable, self._started.values()
         reach = {arc.id: (arc.mask | class_of(arc).reach) & exclusive for arc in started if arc.patterns}
         found, off_limits = list[tuple[Rc, HolderSet]](), 0
@@ -112,7 +112,7 @@ class _DryRun:
         while found and off_limits != before:
             before = off_limits
             off_limits |= union(mask for mask in reach.values() if mask & before)
-        # An operator waits for nobody's votes but its own.
+        # Operators don't wait for the votes of others.
         waiting = (
             arc for arc in started if reach.get(arc.id, 0) & off_limits and not self.state.operator(arc.priority)
         )
@@ -151,7 +151,7 @@ class _DryRun:
             heapq.heappush(self._heap, following)
 
     def _is_held(self, on: Watched, arc: Arc) -> bool:
-        """Return True if no watcher from `arc` on can start: RC or class are held again, and no path frees them."""
+        """Return True if no watcher from `arc` on can start: its RC or class is held again, and no path frees it."""
         if isinstance(on, Rc):
             held, reach = not on.sharable and bool(on.non_preemptible_holders(arc, self.state.now)), on.bit
         else:
@@ -159,8 +159,8 @@ class _DryRun:
         return held and not (reach & self._movable and self._has_paths(arc))
 
     def _has_paths(self, arc: Arc) -> bool:
-        """Return False if a path for `arc` has nowhere to end: no RC is free, and no hold may end for it; or if there
-        was none for another of its class."""
+        """Return False if no path for `arc` can exist: no RC is free and no hold may end for it, or another ARC of its
+        class found none."""
         state = self.state
         if arc.like is not None and self._failed.get(arc.like) == state.version:
             return False
@@ -183,7 +183,9 @@ class _DryRun:
         found = verdict if isinstance(verdict, Admissible) else None
         if self._movable and (found is None or found.victims) and self._has_paths(arc):
             bound = arc.bound
-            if self._bind_anew(arc, may_preempt=False) or (found is None and self._bind_anew(arc, may_preempt=True)):
+            if self._start_by_moving(arc, may_preempt=False) or (
+                found is None and self._start_by_moving(arc, may_preempt=True)
+            ):
                 return
             state.bind(arc, bound)
             if arc.like is not None and not (arc.like.reach | arc.named_mask) & state.sharable:
@@ -206,7 +208,7 @@ class _DryRun:
             self._call(victim.mask, arc.rank)
 
     def _end(self, arc: Arc) -> None:
-        """End a hold; its ARC may start on other RCs by its patterns."""
+        """End a hold; its ARC may restart on other RCs by its patterns."""
         assert arc.hold is not None  # noqa: S101
         if arc.patterns and not arc.past_min_runtime(self.state.now) and not self.state.is_barred(arc):
             arc.like = arc.like or self.state.class_for(arc)
@@ -216,7 +218,7 @@ class _DryRun:
         self._leave(arc)
 
     def _drop(self, arcs: Iterable[Arc]) -> None:
-        """Note which of these ARCs, that end or would with a veto, are granted at this instant."""
+        """Note the ARCs granted at this instant among these, which end or would end after a veto."""
         self._dropped |= {arc.id for arc in arcs if arc.hold is not None and arc.hold.start == self.state.now}
 
     def _start(self, arc: Arc) -> None:
@@ -238,7 +240,7 @@ class _DryRun:
         for rc in arc.rcs:
             holders = self._holders_of(rc)
             del holders[arc.id]
-            if not holders:  # an ARC that moves takes the RC of a victim before this ends
+            if not holders:  # a moving ARC takes the RC of a victim before the victim ends
                 self.state.busy &= ~rc.bit
         self._count(arc, -1)
 
@@ -254,14 +256,14 @@ class _DryRun:
         return rc.holders
 
     def _moves(self, arc: Arc) -> Iterator[tuple[Rc, Need]]:
-        """The exclusive RCs of an ARC that starts by pattern, each with its need."""
+        """The exclusive RCs that a starting ARC has by pattern and may leave for others, each with its need."""
         if arc.like is not None and arc.claim is None and not arc.request.continues:
             for need, name in arc.bound.items():
                 if not (rc := self.state.rc(name)).sharable:
                     yield rc, need
 
-    def _bind_anew(self, arc: Arc, *, may_preempt: bool) -> bool:
-        """Start `arc` by binding others that start in this run to other RCs; `may_preempt`: ending whom it may."""
+    def _start_by_moving(self, arc: Arc, *, may_preempt: bool) -> bool:
+        """Start `arc` by moving others that start in this run to other RCs. With `may_preempt` holds may end for it."""
         state = self.state
         blocking = [
             rc
@@ -298,14 +300,14 @@ class _DryRun:
 
 
 class _Paths:
-    """A matching of needs and exclusive RCs: of the ARCs that start in a dry run, and of the one to add."""
+    """A matching of needs and exclusive RCs, for the ARCs that start in a dry run and the ARC to add."""
 
     def __init__(self, state: SchedulerState, arc: Arc, reserved: Reservations | None, *, may_preempt: bool) -> None:
         self._state, self._arc, self._reserved = state, arc, reserved
         self._owner: dict[int, tuple[Arc, Need]] = {}
         self._bound: dict[ArcId, dict[Need, RcName]] = {}
         self._free = state.present & ~state.sharable & ~state.busy
-        self._own = 0  # bits of the RCs that only `arc` may take, as it may end their holders
+        self._own = 0  # bits of the RCs that only `arc` may take, by preempting their holders
         if may_preempt:
             for rc in state.rcs_in(state.busy):
                 for holder in rc.holders.values():
@@ -319,7 +321,8 @@ class _Paths:
         self._owner[rc.bit] = arc, need
 
     def add(self) -> bool:
-        """Find separate RCs for all needs of the ARC to add; the others keep theirs, or get others."""
+        """Find separate RCs for all needs of the ARC to add; the others keep theirs or move. Return False if there are
+        none."""
         state, arc = self._state, self._arc
         wanted: dict[Need, int] = {rc.name: rc.bit for rc in state.rcs_in(arc.named_mask & ~state.sharable)}
         for need, mask in class_of(arc).masks.items() if arc.patterns else ():
@@ -366,7 +369,7 @@ class _Paths:
         return True
 
     def _kept_from(self, arc: Arc, mask: int) -> int:
-        """Bits of the RCs that are reserved for others."""
+        """Bits of the RCs in `mask` that are reserved for others."""
         if (reserved := self._reserved) is None:
             return 0
         rcs = self._state.rcs_in(mask & reserved.bits)

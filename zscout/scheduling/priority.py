@@ -2,10 +2,10 @@
 
 A pass:
 
-1. Take the changes since the last pass: RCs freed, joined or lost, new and invalidated votes.
+1. Collect the changes since the last pass: RCs freed, joined or lost, new and invalidated votes.
 2. Collect the ARCs to check: the ready ones, and the first watcher of each freed RC.
 3. Check them in rank order (`AdmissionCheck`). For each, `a`:
-   a. An RC of `a` is absent, or unwell and `a` no operator's, or its holder is not preempted for `a`: `a` waits.
+   a. `a` waits if an RC of `a` is absent, is unwell and `a` is no operator's, or has a holder not preempted for `a`.
    b. Every sharable RC that `a` needs must accept `a` beside its holders without the exclusive victims (of exclusive
     RCs of `a`) and the preemptible sharers (of sharable RCs of `a`). Otherwise `a` waits, and nothing is preempted.
    c. Reprieve: preemptible sharers stay, in rank order, as long as the votes allow; others are preempted.
@@ -13,15 +13,15 @@ A pass:
 4. Index `a` by its obstacle, or preempt its victims and start it; check the ARCs that this affects.
 
 An unknown vote leaves a check undecided, and so does a reservation (`reservations.py`) if this pass has changed any:
-the next pass finds them again. The RCs that an undecided check would take or free are *off limits* for lower ranks, and
-so are those of a check that this stops; all others continue.
+the next pass checks again. The RCs that an undecided check would take or free are *off limits* for lower ranks, and so
+are the RCs of each lower rank that must wait for this; all other ARCs continue.
 
 **Why a pass can run again at any time.** An RC taken by a lower rank never makes a higher rank possible (a lower rank
-only preempts holders that the higher one would preempt too, and votes are monotone). So an answer runs the next pass,
-and the outcome is the same as with immediate votes.
+only preempts holders that the higher one would preempt too, and votes are monotone). So each answer may run a pass, and
+the outcome is the same as with immediate votes.
 
 **Why the index may skip ARCs** (`QueueIndex`). The outcome is the same as for a pass over the whole queue, because an
-ARC is skipped only where its check would again end in "waits", stopping no other and asking nothing:
+ARC is skipped only where its check would again end in "waits", without stopping another ARC or asking for a vote:
 
 - WATCHING an RC that is not off limits. (a) Absent or unwell: until it joins or is well. (b) Exclusive, its holder
   not preempted: until the holder ends or passes its minimum runtime. A watcher that takes the RC outranks all
@@ -29,14 +29,14 @@ ARC is skipped only where its check would again end in "waits", stopping no othe
   of them ends or passes its minimum runtime, or the RC's rules change; more holders leave a veto in force, because an
   RC that accepts a set accepts each subset. (d) Reserved for another (`reservations.py`): until its reservations
   change. When the RC becomes off limits, its watchers below are checked.
-- PARKED before an RC that does not answer. Its check reads nothing outside its footprint; it is checked when anything
-  within changes, is answered or becomes off limits, and when the RC may be asked again.
+- PARKED before an RC that does not answer. Its check reads nothing outside its footprint; it is checked when an RC of
+  the footprint changes, answers or becomes off limits, and when the silent RC may be asked again.
 - VOTING or DEFERRED without changes in its footprint: its RCs and the mask of its obstacles are still off limits, or it
   waits for the same votes as before.
 
 An ARC with patterns is always checked, unless an RC that it names keeps it out, or it is WATCHING with its class: too
-many of the RCs that match are absent or held without preemption (`patterns.short`), for all of the class, until one of
-them joins, is freed or becomes off limits. Then its members are checked in rank order until it is short again."""
+many matching RCs are absent or held without preemption (`patterns.short`) for any member, until one of these RCs joins,
+is freed or becomes off limits. Then the members are checked in rank order until the class is short again."""
 
 from __future__ import annotations
 
@@ -58,7 +58,8 @@ from zscout.types import Need
 
 VOTING: Final = Reason(ReasonCode.VOTING)
 MAX_REPORTED: Final = 4
-"""Watchers of an RC that learn of a new holder (the others by `Core.arc`): bounds the reports in a long queue."""
+"""Watchers of an RC that get a report of its new holder; bounds the reports in a long queue. `Core.arc` has the reasons
+of the others."""
 
 
 class Priority(Strategy):
@@ -76,10 +77,10 @@ def run_pass(
     reserved: Reservations | None = None,
     plan: BindingPlan | None = None,
 ) -> None:
-    """One pass over the ARCs that changes affect.
+    """Run a pass over the ARCs that changes affect.
 
     `off_limits`: bits of RCs that another strategy still decides about. `reserved`: reservations for starving ARCs,
-    absent in the paper."""
+    which the paper does not have."""
     plan = dry_run(state, reserved) if plan is None else plan
     for rc, holders in plan.unknown:
         actions.propose(rc, holders)
@@ -87,8 +88,8 @@ def run_pass(
 
 
 def reasons_of_now(state: SchedulerState) -> Iterator[tuple[Arc, Reason]]:
-    """New reasons of the best MAX_REPORTED watchers of each RC taken since the last call. No pass computes them:
-    most are out of date before they are read."""
+    """The new reasons of the best MAX_REPORTED watchers of each RC taken since the last call. Passes don't compute
+    them, as most would be out of date before they are read."""
     unreported, state.index.unreported = state.index.unreported & state.index.watched, 0
     classes, state.index.unreported_classes = state.index.unreported_classes, {}
     reported: list[Watched] = [*state.rcs_in(unreported), *classes]
@@ -122,7 +123,7 @@ class Pass:
         self.changed = 0  # bits of the RCs changed since the last pass began
         self._heap: list[tuple[Rank, int, Arc, Watched | None]] = []
         """The next ARCs to check, beside the ready ones; each RC and class has one watcher here."""
-        self._walked: set[Watched] = set()  # those with a watcher in the heap
+        self._walked: set[Watched] = set()  # RCs and classes with a watcher in the heap
         self._changed_here = 0  # bits of the RCs changed by this pass
 
     def run(self, ready_arcs: Iterable[Arc], off_limits: int = 0) -> None:
@@ -148,7 +149,7 @@ class Pass:
                     self._check(arc)
             if on is not None:
                 self._call_next_watcher(on, last)
-        # ARCs checked before a later change have not seen it.
+        # ARCs checked before a change of this pass have not seen it.
         self.index.touched |= self._changed_here
 
     def _check(self, arc: Arc) -> None:
@@ -159,7 +160,7 @@ class Pass:
             self._apply(arc, check, judge(check, self.reserved, self.off_limits))
 
     def _check_patterns(self, arc: Arc) -> None:
-        """Try bindings, best first, until the ARC starts or asks votes. With too few RCs none can do."""
+        """Try bindings, best first, until the ARC starts or asks for votes; none, if too few RCs are usable."""
         if not self.off_limits & class_of(arc).reach and short(self.state, arc):
             self._watch_class(arc)
             return
@@ -188,7 +189,7 @@ class Pass:
     def _apply(self, arc: Arc, check: AdmissionCheck, verdict: Verdict) -> None:
         match verdict:
             case Inadmissible(rc, reason, proposal) if proposal is not None:
-                # A silent RC is asked again at times: no change there would queue the check.
+                # A silent RC is asked again from time to time; no change there would queue the check.
                 silent = rc.name in self.votes.unresponsive
                 self.index.put(arc, ArcState.READY)
                 self.actions.wait(arc, reason if silent else VOTING, settled=silent)
@@ -212,7 +213,7 @@ class Pass:
                         reason = reason._replace(rcs=check.refusing(pattern))
                     self.actions.wait(arc, reason._replace(pattern=pattern))
             case "over quota":
-                # The end of any ARC of its owner may admit it: no RC shows that.
+                # The end of any ARC of its owner may admit it, and no RC shows that.
                 self.index.put(arc, ArcState.READY)
                 quota = self.state.policy.max_running_per_host or 0
                 self.actions.wait(arc, Reason(ReasonCode.QUOTA, detail=arc.owner, number=quota))
@@ -247,18 +248,18 @@ class Pass:
     def _defer(self, arc: Arc, check: AdmissionCheck, state: ArcState) -> None:
         footprint = self._within_reach(arc, check)
         if arc.patterns:
-            # Always checked again: another RC may serve it, if the one that is asked refuses.
+            # Always checked again: if the RC that is asked refuses, another may serve the ARC.
             self.index.put(arc, ArcState.READY)
         else:
             self.index.put(arc, state, footprint, check.masked_obstacles())
         self._put_off_limits(footprint, arc.rank)
 
     def _within_reach(self, arc: Arc, check: AdmissionCheck) -> int:
-        """Bits of the RCs that the ARC would take or free."""
+        """Bits of the RCs that the ARC would take or free, and of the alternatives for its patterns."""
         return check.footprint() | (alternatives(self.state, arc) if arc.patterns else 0)
 
     def _still_deferred(self, arc: Arc, footprint: int) -> bool:
-        """Return True if a repeated check would be undecided again."""
+        """Return True if another check would be undecided again."""
         if footprint & self.changed or arc.masked_obstacles & ~self.off_limits:
             return False
         if arc.state is not ArcState.VOTING and not footprint & self.off_limits:
@@ -284,7 +285,7 @@ class Pass:
         votes.answered.clear()
 
     def _take_changes(self, rank: Rank | None) -> int:
-        """Queue the ARCs affected by changes, below `rank`; return the changed RCs."""
+        """Queue the ARCs below `rank` that changes affect. Return bits of the changed RCs."""
         index = self.index
         freed, touched = index.freed, index.freed | index.touched
         index.freed = index.touched = 0
@@ -311,8 +312,8 @@ class Pass:
             heapq.heappush(self._heap, following)
 
     def _needs_check(self, on: Watched, arc: Arc) -> bool:
-        """Return False to end the walk along these watchers: RC or class are held again, and no watcher from `arc` on
-        may preempt the holder. `reasons_of_now` reports their reasons later."""
+        """Return False to end the walk along these watchers: the RC or class is held again, and no watcher from `arc`
+        on may preempt the holder. `reasons_of_now` reports their reasons later."""
         if isinstance(on, PatternClass):
             if on.reach & self.off_limits or not all_present(self.state, arc) or not short(self.state, arc):
                 return True

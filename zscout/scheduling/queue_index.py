@@ -16,12 +16,13 @@ class QueueIndex:
 
     - READY, VOTING and DEFERRED: checked by the next pass. Every ARC begins as READY, and stays so under a strategy
       without an index. VOTING and DEFERRED have a *footprint*, the RCs that the ARC would take or free: without changes
-      there, another check would end alike.
-    - WATCHING one RC that alone keeps it out: absent, held without preemption, or vetoing. No event elsewhere can let
-      it start. Or, as part of its class, all RCs that its patterns match, where too few are left (`patterns.short`).
-    - PARKED before an RC that does not answer: a change within its footprint makes it ready.
+      there, another check would end in the same way.
+    - WATCHING an RC that alone keeps the ARC out: it is absent, held without preemption, or vetoes. No event elsewhere
+      can let the ARC start. An ARC with patterns may, with its class, watch all RCs that its patterns match, while too
+      few are usable (`patterns.short`).
+    - PARKED before an RC that does not answer: a change within the footprint makes the ARC ready.
 
-    Sorted lists: 10,000 ranks move in a few microseconds."""
+    Sorted lists are quick enough: 10,000 ranks move in a few microseconds."""
 
     def __init__(self, band: Callable[[int], int]) -> None:
         self._band = band
@@ -30,8 +31,8 @@ class QueueIndex:
         self.watched = 0  # bits of the RCs with watchers
         self.watched_classes: dict[PatternClass, None] = {}  # classes with watchers
         self.freed = 0  # bits of the RCs that may admit watchers since the last pass
-        self.touched = 0  # bits of the RCs with other changes: these affect all but watchers
-        self.unreported = 0  # bits of the RCs with new holders that are not reported to watchers yet
+        self.touched = 0  # bits of the RCs with other changes: these affect all ARCs but watchers
+        self.unreported = 0  # bits of the RCs with new holders not yet reported to watchers
         self.unreported_classes: dict[PatternClass, None] = {}
         self.contended = 0  # bits of the RCs whose holders may have another upcoming end (`upcoming.py`)
         self.ranks: list[Rank] = []  # of all queued ARCs, best first
@@ -65,8 +66,8 @@ class QueueIndex:
         del self._not_starving[:count]
 
     def next_starving(self, now: Ns) -> Ns | None:
-        """When the next ARC begins to starve, where others do: these may be kept a later place then, and let somebody
-        pass."""
+        """When the next ARC begins to starve, if others starve already: their reservations may then move to a later
+        time, and let an ARC pass."""
         coming = bisect_right(self._not_starving, now, key=itemgetter(0))
         return self._not_starving[coming][0] if self.starving and coming < len(self._not_starving) else None
 
@@ -101,7 +102,7 @@ class QueueIndex:
                 self.watched_classes[on] = None
 
     def put(self, arc: Arc, state: ArcState, footprint: int | None = None, masked_obstacles: int = 0) -> None:
-        """Put `arc` in this state, not WATCHING. READY has no footprint."""
+        """Put `arc` in this state; not for WATCHING. READY has no footprint."""
         self._leave(arc)
         arc.move_to(state)
         (self.parked if state is ArcState.PARKED else self.ready)[arc.id] = arc

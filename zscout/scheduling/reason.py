@@ -22,37 +22,37 @@ class ReasonCode(StrEnum):
     ABSENT = "absent"
     """`rcs` are not on the mesh or can't carry holders; `detail`: the cause, if known."""
     UNWELL = "unwell"
-    """`rcs` are not well, and granted to operators only; `detail`: the cause."""
+    """`rcs` are unwell, and granted to operators only; `detail`: the cause."""
     NO_MATCH = "no_match"
-    """No RC is left for the patterns in `rcs`; `detail`: why matching RCs are lost."""
+    """No RC is left for the patterns in `rcs`; `detail`: why matching RCs are lost or unwell."""
     HELD = "held"
-    """`rcs` are held by `by`, one each, not preempted for it; for a pattern, all choices. `detail`: the group
+    """`rcs` are held by `by`, one each, which it may not preempt; for a pattern, all choices. `detail`: the group
     preferred by fair shares."""
     VETOED = "vetoed"
-    """The RC refuses it beside its holders `by`, not preempted for it; `detail` in the RC's own words."""
+    """The RC refuses it beside the holders `by`, which it may not preempt; `detail`: the RC's own words."""
     UNCONFIRMED = "unconfirmed"
-    """`rcs` did not confirm a grant: no new grant for a while."""
+    """`rcs` did not confirm a grant: it is not granted again for a while."""
     CLAIMED = "claimed"
     SILENT = "silent"
     RESERVED = "reserved"
     BOOKED = "booked"
-    """The RC is booked by `by` before this would end."""
+    """The RC is booked by `by` for a time before the ARC would end."""
     MAINTENANCE = "maintenance"
-    """The RC is in maintenance by `by`, or will be before this would end. It also ends kept holds."""
+    """The RC is in maintenance by `by`, or will be before the ARC would end. It also ends kept holds."""
     BROKEN = "broken"
     """`by` has reported that the RC is broken: it is granted to operators only."""
     NOT_YET = "not_yet"
     QUOTA = "quota"
     """`detail`, its host, has its quota of ARCs running: `number`."""
     RC_QUOTA = "rc_quota"
-    """With it `detail`, a name or a group, would hold more RCs than its quota: `number`."""
+    """With this ARC `detail`, a name or a group, would hold more RCs than its quota: `number`."""
     VOTING = "voting"
     """Votes on it or on a higher rank are out."""
     SEARCHING = "searching"
     # A hold, or a wait, ended:
     EXPIRED = "expired"
     LIMIT = "limit"
-    """It had the longest time that the fleet gives a hold."""
+    """It lasted for the fleet's `max_runtime`."""
     PREEMPTED = "preempted"
     DISPLACED = "displaced"
     """A kept hold past its minimum runtime, by `by`."""
@@ -69,7 +69,7 @@ class ReasonCode(StrEnum):
 
 
 class Party(NamedTuple):
-    """An ARC in another's way or preferred to it; `str` is its name and its person."""
+    """An ARC that is in the way of another or preferred to it; `str` is its name and its person."""
 
     arc: ArcId
     name: str
@@ -78,14 +78,14 @@ class Party(NamedTuple):
     until: Ns | None = None
     """When its hold ends or may be preempted, at the latest; None: unknown."""
     label: str = ""
-    """Its words in a view that names it otherwise."""
+    """The text of `str` in views that describe it in other words."""
 
     def __str__(self) -> str:
         return self.label or named(self.who, self.arc.rpartition("/")[0], self.name)
 
     @property
     def comment(self) -> str:
-        """What its user wants others to know, as the end of a sentence."""
+        """Its user's comment for others, as the end of a sentence."""
         return f": {clean(self.who.comment)}" if self.who is not None and self.who.comment else ""
 
 
@@ -102,7 +102,7 @@ def named(who: Who | None, client: ClientId, arc: str) -> str:
 
 
 Until = Callable[[Ns], str]
-"""Formats the end of another's hold: `14:32`."""
+"""Formats the end of a hold: `14:32`."""
 
 
 class Reason(NamedTuple):
@@ -115,7 +115,7 @@ class Reason(NamedTuple):
     detail: str = ""
     number: int = 0
     pattern: Need | None = None
-    """The unmet pattern; the rest is about one RC that matches it, or with `patterns` about all."""
+    """The unmet pattern; the other fields are about a matching RC, or with `patterns` about all."""
     patterns: tuple[Need, ...] = ()
     """For each of `rcs` the pattern that it is a choice for, empty where named."""
 
@@ -128,7 +128,7 @@ class Reason(NamedTuple):
         return self.code in (ReasonCode.CANCELLED, ReasonCode.RELEASED) and not self.detail
 
     def text(self, until: Until | None = None) -> str:
-        """In words; with `until` including the ends of others' holds."""
+        """The text; with `until` it includes the ends of others' holds."""
         if self.code is ReasonCode.HELD:
             return _held(self, until)
         if self.code is ReasonCode.VETOED:
@@ -144,8 +144,8 @@ _PREFERRED: Final = (ReasonCode.PREEMPTED, ReasonCode.DISPLACED)
 
 
 def reason_of(why: ReasonInfo | None, label: Callable[[ReasonParty], str] = lambda _: "") -> Reason | None:
-    """A reason that names other ARCs, as a message has it; `until` in ns from then on. None for others: their text
-    says all. `label`: words for an ARC, if not its name and person."""
+    """The reason in a message, if it names other ARCs, with their `until` in ns from now. None for other reasons: their
+    text is complete. `label`: the text for an ARC, if not its name and person."""
     if why is None or not why.by or not (why.code in _PREFERRED or (why.code in _NAMING and why.rcs)):
         return None
     by = tuple(
@@ -171,7 +171,8 @@ def waits_for_others(why: Reason | ReasonInfo | None) -> bool:
 
 
 def waits(reason: str, why: Reason | ReasonInfo | None) -> str:
-    """How something waits, after its name: `waits for survey (alice@ws1): robot/a`, `waits: votes are out`."""
+    """The text that follows the name of a waiting ARC: `waits for survey (alice@ws1): robot/a`, `waits: votes are
+    out`."""
     return reason if waits_for_others(why) else f"waits: {reason}"
 
 
@@ -180,18 +181,18 @@ _OUTCOMES: Final = (ReasonCode.PREEMPTED, ReasonCode.CANCELLED, ReasonCode.RELEA
 
 
 def ended(outcome: str, reason: str, why: Reason | ReasonInfo | None) -> str:
-    """How something ended: `preempted by ...`, `lost: robot/a ended the hold`."""
+    """The text for an ended ARC: `preempted by ...`, `lost: robot/a ended the hold`."""
     word = outcome.replace("_", " ")
     return reason if why is not None and why.code in _OUTCOMES else f"{word}: {reason}" if reason else word
 
 
 def kept(priority: int) -> str:
-    """How long a hold of this priority continues after its minimum runtime, if it is kept."""
+    """The text for how long a kept hold of this priority lasts after its minimum runtime."""
     return f"until a request of priority {priority} or more waits for it"
 
 
 def starting(left: float) -> str:
-    """A hold whose devices have begun in `left` seconds at the latest."""
+    """The text for a hold whose devices begin within `left` seconds."""
     return f"starting, ready in about {max(1, round(left))} s"
 
 
@@ -215,7 +216,7 @@ def _vetoed(reason: Reason, until: Until | None) -> str:
 
 
 def short_names(rcs: Iterable[RcName]) -> Iterator[RcName]:
-    """RCs in a row, without repeating a kind."""
+    """RCs for a list, without a kind that repeats the one before."""
     last = ""
     for rc in rcs:
         kind = rc.partition("/")[0] + "/"
@@ -224,7 +225,7 @@ def short_names(rcs: Iterable[RcName]) -> Iterator[RcName]:
 
 
 def base(pattern: Need) -> Need:
-    """`fg/*` for `fg/*#2`, which asks for a second such device."""
+    """`fg/*` for `fg/*#2`, which requests a second such device."""
     return pattern.partition("#")[0]
 
 
@@ -237,7 +238,7 @@ _COUNTS: Final = dict(enumerate(("one", "two", "three", "four", "five", "six", "
 
 
 def _held(reason: Reason, until: Until | None) -> str:
-    """Holders in the way: of the named RCs, then of each pattern's choices."""
+    """The text about holders in the way: of the named RCs, then of each pattern's choices."""
     patterns = reason.patterns or ("",) * len(reason.rcs)
     held = list(zip(reason.rcs, reason.by, patterns, strict=False))
     parts = []

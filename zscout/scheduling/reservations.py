@@ -1,8 +1,9 @@
 """Bounded waiting: once an ARC has waited for its patience it is *due*, and no other may pass it.
 
-Shortest-first starves, and so do larger sets of ARCs. The remedy is reservation with conservative backfill (Mu'alem and
-Feitelson, IEEE TPDS 12(6), 2001), on distinct RCs instead of equal processors, and from the time at which the ARC is
-due: an ARC that would end before is not held back. Minimum runtimes are exact, so reservations are.
+Ranks prefer short ARCs, and searches prefer large sets: both let other ARCs starve. The remedy is reservation with
+conservative backfill (Mu'alem and Feitelson, IEEE TPDS 12(6), 2001), on distinct RCs instead of equal processors, and
+from the time at which the ARC is due: an ARC that would end before is not held back. Minimum runtimes are exact, so
+reservations are exact too.
 
 From half its patience on, an ARC is *starving*. By priority, then by when they began to starve, each starving ARC gets
 the earliest time, from when it is due, at which its RCs are free of holders that do not yield to it then and of earlier
@@ -10,8 +11,8 @@ starving ARCs. An ARC of equal or lower priority on these RCs may start only if 
 sharable and accepts it beside all concerned.
 
 A booking reserves its RCs for its own time. Promises to equals are kept in the order in which they were made: starving
-ARCs avoid older bookings and ignore newer ones. Maintenance precedes all promises except to higher priorities, and all
-while it lasts.
+ARCs avoid older bookings and ignore newer ones. Maintenance precedes all promises except those to higher priorities;
+while it lasts it precedes these too.
 
 With fair shares an ARC whose group had more than another waiting group counts as queued later (`Arc.late`).
 
@@ -33,7 +34,7 @@ from zscout.scheduling.votes import HolderSet
 from zscout.types import ArcId, Ns
 
 MAX_STARVING: Final = 16
-"""ARCs with reservations at one time; later starving ARCs follow as these start."""
+"""ARCs with reservations at a time; later starving ARCs follow as these start."""
 
 
 Order: TypeAlias = tuple[bool, int, Ns, str]
@@ -51,7 +52,7 @@ class Reservation(NamedTuple):
 
     @property
     def excludes(self) -> bool:
-        """Maintenance: the RC has no other holder."""
+        """Return True for maintenance: the RC has no other holder."""
         return not self.order[0]
 
     def over(self) -> Ns:
@@ -59,7 +60,7 @@ class Reservation(NamedTuple):
 
 
 class Inadmissible(NamedTuple):
-    """`rc` keeps an ARC out while this lasts, or until the vote on `proposal` changes it."""
+    """`rc` keeps an ARC out for `reason`, unless the vote on `proposal` changes that."""
 
     rc: Rc
     reason: Reason
@@ -73,13 +74,13 @@ def order_of(state: SchedulerState, booking: Booking) -> Order:
 
 
 def yields(holder: Arc, other: Arc, time: Ns) -> bool:
-    """Return True if a hold is over at some time, or yields to an ARC that comes then."""
+    """Return True if a hold is over at `time`, or `other` may preempt it then."""
     return holder.known_end(other) <= time or holder.preemptible_by(other, time)
 
 
 def reservations(state: SchedulerState, last: Reservations | None) -> Reservations:
-    """The present reservations: `last` if nothing has changed that it depends on. Passing time alone does not change
-    RCs or order; for a due ARC no backfill is possible."""
+    """The present reservations: `last`, if nothing that it depends on has changed. Time alone changes neither RCs nor
+    order; for a due ARC no backfill is possible."""
     if state.policy.patience is not None:
         state.index.mark_starving(state.now, state.queued)
     state.dates.pass_time(state.now, state.present)
@@ -93,12 +94,13 @@ def _versions(state: SchedulerState) -> tuple[int, ...]:
 
 
 class Reservations:
-    """Those of bookings are looked up as they are now: while held too, as this pass may preempt them."""
+    """Reservations of starving ARCs, made once, and of bookings, looked up on use. Held bookings have theirs too, as a
+    pass may preempt their holds."""
 
     def __init__(self, state: SchedulerState) -> None:
         self._state, self._votes = state, state.votes
         self.made_of = _versions(state)
-        self.starving: dict[int, list[Reservation]] = {}  # of starving ARCs, by bit of the RC, in their order
+        self.starving: dict[int, list[Reservation]] = {}  # of starving ARCs, by bit of the RC, in order
         self._free: dict[int, Ns] = {}  # by bit: the end of earlier reservations
         self.starts: list[Ns] = []  # reserved times of starving ARCs
         for priority, since, arc in state.index.starving[:MAX_STARVING]:
@@ -108,11 +110,11 @@ class Reservations:
 
     @property
     def current(self) -> bool:
-        """Return True if nothing has changed that these depend on."""
+        """Return True if nothing that these depend on has changed."""
         return self.made_of == _versions(self._state)
 
     def at(self, rc: Rc, start: Ns, end: float) -> list[Reservation]:
-        """The bookings of `rc` in this span, and all its reservations for starving ARCs, in their order."""
+        """The bookings of `rc` in this span, and all its reservations for starving ARCs, in order."""
         state, found = self._state, list(self.starving.get(rc.bit, ()))
         if rc.bit & state.dates.claimed and (claims := state.dates.booked(rc, start, end)):
             for claim in claims:
@@ -130,11 +132,11 @@ class Reservations:
     def _beside_bookings(self, arc: Arc, rcs: list[Rc], start: Ns, order: Order) -> Ns:
         """The earliest time from `start` at which `arc` meets no booking."""
         while blocking := [end for rc in rcs for end in self._blocking(arc, rc, start, order)]:
-            start = max(blocking)  # until then `arc` would meet that booking, whenever it starts
+            start = max(blocking)  # a start before this would meet the booking that ends last
         return start
 
     def _blocking(self, arc: Arc, rc: Rc, start: Ns, order: Order) -> Iterator[Ns]:
-        """The ends of bookings of `rc` in the way of `arc` if it starts then."""
+        """The ends of bookings of `rc` that are in the way of `arc` if it starts at `start`."""
         if not rc.bit & self._state.dates.claimed:
             return
         for claim in self._state.dates.booked(rc, start, arc.ends(start)):
@@ -150,7 +152,7 @@ class Reservations:
             return
         start, found = -1.0, float(max(self._state.now, self.due(arc)))
         while start < found:
-            # Who yields now may be protected by then: later times are tried until nobody is in the way.
+            # A holder that yields now may be protected by then: try later times until no holder is in the way.
             start = found
             found = max(start, self._within_quota(arc), *(self._free_from(rc, arc, order, int(start)) for rc in rcs))
             if math.isinf(found):
@@ -164,7 +166,7 @@ class Reservations:
             self._free[rc.bit] = max(self._free.get(rc.bit, 0), arc.ends(start))
 
     def _rcs(self, arc: Arc, order: Order) -> list[Rc]:
-        """The RCs to reserve: for each pattern the match that is free first; an absent placeholder if none is left."""
+        """The RCs to reserve, for each pattern the match that is free first. If none is left, an absent placeholder."""
         rcs = list(self._state.rcs_in(arc.named_mask)) if arc.patterns else list(arc.rcs)
         for need in arc.patterns:
             matching = self._state.matching(need)
@@ -194,14 +196,14 @@ class Reservations:
         return max(ends)
 
     def _free_from(self, rc: Rc, arc: Arc, order: Order, time: Ns) -> float:
-        """When `rc` has room for `arc` at the latest, without those who yield at `time`; infinite if unknown."""
+        """The time by which `rc` has room for `arc`, ignoring holders that yield at `time`; infinite if unknown."""
         non_preemptible = rc.non_preemptible_holders(arc, time)
         if rc.sharable:
             return self._room_from(rc, arc, order, non_preemptible)
         return max((self._free.get(rc.bit, self._state.now), *(holder.known_end(arc) for holder in non_preemptible)))
 
     def _room_from(self, rc: Rc, arc: Arc, order: Order, holders: list[Arc]) -> float:
-        """When a sharable RC accepts `arc` beside its holders and earlier promises that are not over by then."""
+        """The first time at which a sharable RC accepts `arc` beside the holders and earlier promises not over then."""
         now, votes = self._state.now, self._votes
         before = [promise for promise in self.before(rc, order, now, arc.ends(now)) if not promise.excludes]
         ends = [(holder.known_end(arc), holder.id) for holder in holders]
@@ -221,8 +223,8 @@ class Reservations:
         return arc.since + arc.late + arc.patience
 
     def free_until(self, arc: Arc, end: Ns) -> Ns:
-        """The first reserved time of the RCs of `arc` from now on that is not its own, nor for starving ARCs of lower
-        priority; `end` if that is earlier."""
+        """The first reserved time of the RCs of `arc` from now on, or `end` if that is earlier. Its own and those of
+        starving ARCs of lower priority don't count."""
         now, band = self._state.now, self._state.band
         for rc in self._state.rcs_in(arc.mask & self.bits):
             for promise in self.at(rc, now, end):
@@ -232,8 +234,8 @@ class Reservations:
         return end
 
     def goes_first(self, arc: Arc) -> bool:
-        """Return True if `arc` precedes its equals. A sharable RC may accept each backfilled ARC alone but not all
-        together, so a due ARC goes first there."""
+        """Return True if `arc` precedes its equals: it has taken up a booking or is due, and needs a sharable RC, which
+        may accept each backfilled ARC alone but not all together."""
         state = self._state
         due = arc.claim is not None or (arc.starving and self.due(arc) <= state.now)
         return due and bool(arc.mask & state.sharable)
@@ -267,7 +269,7 @@ class Reservations:
 
     def _binding(self, rc: Rc, arc: Arc) -> tuple[list[Reservation], bool]:
         """The reservations of `rc` that bind `arc` if it starts now: those before its own and, until its own time, all
-        bookings; and whether any of these would let it start early."""
+        bookings. True: later bookings are among them, so its own time may let it start."""
         now = self._state.now
         reserved = self.at(rc, now, arc.ends(now))
         own = self._own(rc, arc)
@@ -287,9 +289,9 @@ class Reservations:
         return Reservation(arc, claim.booking.start, order_of(self._state, claim.booking), claim.booking.end)
 
     def _together(self, rc: Rc, arc: Arc, before: list[Reservation]) -> list[HolderSet]:
-        """The holder sets beside `arc`, from now until it ends: at each arrival, without the holders that yield to it.
-        A starving ARC may start before its reserved time, but not before those reserved for earlier: where one arrives,
-        those count too, until they are over."""
+        """The sets of holders with `arc`, from now until it ends: one per arrival, without the holders that yield to
+        the arriving ARC. A starving ARC may start before its reserved time, but not before ARCs with earlier
+        reservations: when it arrives, these count too, until they are over."""
         now, end = self._state.now, arc.ends(self._state.now)
         sets = []
         for time in sorted({now, *(promise.start for promise in before if now < promise.start < end)}):
@@ -302,7 +304,7 @@ class Reservations:
             sets.append(frozenset((*staying, arc.id, *(promise.arc.id for promise in there))))
         if any(promise.booked is not None for promise in before):
             return sets
-        # One question for all; only if that is refused, one for each time.
+        # Ask about all sets at once; only if that is refused, about each set.
         whole = frozenset[ArcId]().union(*sets)
         answer = self._votes.known(rc.name, whole)
         return sets if answer is not None and not answer.accept else [whole]
@@ -321,7 +323,7 @@ class Reservations:
         )
 
     def _delays(self, arc: Arc, reservation: Reservation) -> bool:
-        """Return True if `arc`, started now, would hold reserved RCs at their time, and must not."""
+        """Return True if `arc`, started now, would still hold the RCs at the reserved time, and must not."""
         if reservation.broken and self._state.operator(arc.priority):
             return False
         band, now = self._state.band, self._state.now
@@ -330,12 +332,12 @@ class Reservations:
         return binds and arc.ends(now) > reservation.start
 
     def changed(self, earlier: Reservations) -> int:
-        """Bits of the RCs with other reservations than when `earlier` was made."""
+        """Bits of the RCs whose reservations have changed since `earlier` was made."""
         booked = self._state.dates.changed_since(earlier.made_of[-1])
         return booked | union(self.starving_changed(earlier))
 
     def starving_changed(self, earlier: Reservations) -> dict[int, Ns]:
-        """By bit of the RCs where starving ARCs have other reservations: the end of the last of them."""
+        """By bit of the RCs whose reservations for starving ARCs have changed: the end of the last of these."""
         now, before = self.starving, earlier.starving
         return {
             bit: max(promise.over() for promise in (*now.get(bit, ()), *before.get(bit, ())))

@@ -2,12 +2,12 @@
 
 After Tsafrir, Etsion and Feitelson, "Backfilling using system-generated predictions rather than user runtime estimates"
 (IEEE TPDS 18(6), 2007): requested times still end holds and make promises; predictions serve estimates alone. Histories
-are by name, command and requested RCs, or by name and command where these are too few. The time of a hold that was cut
-short is a lower bound: medians are Kaplan and Meier's ("Nonparametric estimation from incomplete observations", JASA
-53, 1958), among the holds that lasted longer than the present one.
+are by name, command and requested RCs, or by name and command if there are too few such holds. The length of a hold
+that was cut short is a lower bound, so medians are Kaplan and Meier's ("Nonparametric estimation from incomplete
+observations", JASA 53, 1958), among the holds that lasted longer than the present hold.
 
-Each history judges itself: it predicts every hold by the time of earlier holds and by their share of the requested
-time, and uses the better one only where that was nearer than the requested time."""
+Each history measures its own accuracy: it predicts every hold by the length of earlier holds and by their share of the
+requested time. The better method is used, and only if it was more accurate than the requested time."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ from zscout.scheduling.model import ArcRequest, Hold
 from zscout.types import Need, Ns
 
 MAX_HISTORIES: Final = 4_000
-"""The history unused for longest is dropped."""
+"""Beyond, the history unused for longest is dropped."""
 MAX_KEPT: Final = 20
-"""The latest holds of one history."""
+"""Holds per history, the latest."""
 MAX_NEEDS: Final = 32
-"""A request of more RCs is known by name and command alone."""
+"""Requests of more RCs have only the history by name and command."""
 MAX_TEXT: Final = 200
 """Characters of a name or command that count."""
-JUDGED: Final = 2
-"""Holds that a history must have predicted before use: its first hold predicts nothing."""
+MIN_JUDGED: Final = 2
+"""Predicted holds that a history needs before it is used; its first hold is not predicted."""
 TOLERANCE: Final = 1e-9
 
 
@@ -66,8 +66,8 @@ class RuntimeEstimator:
             self._histories.popitem(last=False)
 
     def runtime(self, wish: Wish, elapsed: Ns = 0) -> Ns | None:
-        """The expected length of a hold that has lasted `elapsed` ns: always more. None: no better guess than the
-        requested time."""
+        """The expected length of a hold that has lasted `elapsed` ns, always more than that. None: no better guess than
+        the requested time."""
         for key in wish.histories():
             history = self._histories.get(key)
             if history is not None and (estimate := history.estimate()) is not None:
@@ -84,7 +84,7 @@ class RuntimeEstimator:
 
 
 class _Span(NamedTuple):
-    asked: Ns
+    requested: Ns
     lasted: Ns
     whole: bool
 
@@ -106,33 +106,33 @@ class _History:
         if self._estimates is None:
             self._estimates = _Estimate(self.spans, by_share=False), _Estimate(self.spans, by_share=True)
         best = max(self._estimates, key=lambda estimate: estimate.accuracy)
-        return best if best.judged >= JUDGED else None
+        return best if best.judged >= MIN_JUDGED else None
 
 
 class _Estimate:
-    __slots__ = ("_by_share", "_median", "_values", "accuracy", "asked_accuracy", "judged")
+    __slots__ = ("_by_share", "_median", "_values", "accuracy", "judged", "requested_accuracy")
 
     def __init__(self, spans: Iterable[_Span], *, by_share: bool) -> None:
         self._by_share = by_share
-        self.accuracy = self.asked_accuracy = 0.0
+        self.accuracy = self.requested_accuracy = 0.0
         """Summed over the `judged` holds: of this estimate, and of the requested time."""
         self.judged = 0
         self._values: list[tuple[float, bool]] = []
-        """Each with whether it was cut short; of equals, these last: they would have been longer."""
+        """Sorted lengths, each with True if it was cut short; of equals these come last, as they would be longer."""
         self._median: float | None = None
         for span in spans:
-            unit = span.asked if by_share else 1
+            unit = span.requested if by_share else 1
             if span.whole and self._median is not None:
                 self.accuracy += _accuracy(self._median * unit, span.lasted)
-                self.asked_accuracy += _accuracy(span.asked, span.lasted)
+                self.requested_accuracy += _accuracy(span.requested, span.lasted)
                 self.judged += 1
             insort(self._values, (span.lasted / unit, not span.whole))
             self._median = _median(self._values)
 
-    def runtime(self, asked: Ns, elapsed: Ns) -> Ns | None:
-        if self.accuracy <= self.asked_accuracy + TOLERANCE:
+    def runtime(self, requested: Ns, elapsed: Ns) -> Ns | None:
+        if self.accuracy <= self.requested_accuracy + TOLERANCE:
             return None
-        unit = asked if self._by_share else 1
+        unit = requested if self._by_share else 1
         left = self._values[bisect_right(self._values, (elapsed / unit, True)) :] if elapsed else []
         median = _median(left) if elapsed else self._median
         if median is not None:
@@ -142,7 +142,7 @@ class _Estimate:
 
 
 def _median(values: Sequence[tuple[float, bool]]) -> float | None:
-    """None where too many of the longest were cut short."""
+    """Return None if too many of the longest were cut short."""
     surviving = 1.0
     for at, (value, cut) in enumerate(values):
         if not cut:
@@ -153,5 +153,5 @@ def _median(values: Sequence[tuple[float, bool]]) -> float | None:
 
 
 def _accuracy(expected: float, lasted: Ns) -> float:
-    """From 0 to 1, as in the paper, so that no hold counts more than another."""
+    """The accuracy of a prediction from 0 to 1, as in the paper, so that all holds count alike."""
     return min(expected, lasted) / max(expected, lasted)

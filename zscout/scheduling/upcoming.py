@@ -1,8 +1,8 @@
-"""The ends that other requests, bookings and maintenance bring to holds, for the holders of these.
+"""Upcoming ends of holds, for their holders: the requests, bookings and maintenance that may end each.
 
-The caller asks a tenth of a second later, for all changes until then, as for the reasons to wait: no pass and no grant
-depends on this. A hold has at most one request that waits, the best-ranked, and one booking or maintenance, the one
-that ends it first."""
+No pass and no grant depends on this. As with the reasons to wait, the caller collects changes for a tenth of a second
+before it asks. Reported for each hold are at most the best-ranked waiting request, and the booking or maintenance that
+ends it first."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ from zscout.types import SECOND, ArcId, Ns, RcName
 HORIZON: Final[Ns] = 7 * 86_400 * SECOND
 """Later bookings are not reported yet."""
 MAX_RANKS: Final = 4
-"""Waiting requests that are considered for each RC."""
+"""Waiting requests considered for each RC."""
 MAX_CLASSES: Final = 64
-"""The same of classes of requests with patterns, for all RCs."""
+"""Classes of requests with patterns considered for all RCs together."""
 MAX_CHOICES: Final = 8
-"""Holders that learn of one class: those whose holds end first."""
+"""Holds reported to end for a class: those that yield first."""
 
 UpcomingCode: TypeAlias = Literal["waits", "booked", "maintenance"]
 
 
 class UpcomingEnd(NamedTuple):
-    """`by` waits for `rcs` of a hold, has booked them, or keeps them for maintenance. The hold does not end for it
-    before `until`; 0: it may end at any time. `begins`: the date."""
+    """`by` waits for `rcs` of a hold, has booked them, or needs them for maintenance. The hold does not end for `by`
+    before `until`; 0: it may end at any time. `begins`: the date of a booking or maintenance."""
 
     code: UpcomingCode
     by: Party
@@ -76,7 +76,7 @@ def _choose(state: SchedulerState, region: int, holds: list[Arc]) -> None:
 
 
 def _choices(state: SchedulerState, like: PatternClass, chosen: Container[ArcId]) -> list[Arc]:
-    """The holds that end for this class beside those already `chosen`."""
+    """The holds that may have to end for this class, not counting those already `chosen`."""
     first = state.queued[like.members[0][-1]]
     reach = like.reach & state.present & ~state.sharable
     missing = len(like.members) * len(like.masks) - (reach & ~state.busy).bit_count()
@@ -111,7 +111,7 @@ def _yields(arc: Arc, other: Arc) -> bool:
 
 
 def _is_in_way(rc: Rc, other: Arc) -> bool:
-    """Return True unless a sharable RC lets both hold it."""
+    """Return True unless both can hold the sharable RC."""
     if not rc.sharable:
         return True
     why = other.reason
@@ -137,7 +137,7 @@ def _dated(state: SchedulerState, arc: Arc) -> UpcomingEnd | None:
 
 
 def _ends(state: SchedulerState, arc: Arc) -> Iterator[tuple[Ns, Ns, str]]:
-    """By booking until when a hold does not end for it, and its date."""
+    """For each booking in the way of a hold: the time before which the hold does not end for it, its date and id."""
     now = state.now
     for rc in arc.rcs:
         for claim in state.dates.of(rc, now, now + HORIZON):
@@ -149,7 +149,7 @@ def _ends(state: SchedulerState, arc: Arc) -> Iterator[tuple[Ns, Ns, str]]:
 
 
 def _until_date(arc: Arc, claim: Claim, *, sharable: bool) -> Ns | None:
-    """Until when a hold does not end for a booking; None: it does not end for it at all."""
+    """The time before which a hold does not end for a booking; None: it does not end for it at all."""
     hold, booking, date = arc.hold, claim.booking, claim.date
     if hold is None or booking.broken or (hold.last is not None and hold.last <= date):
         return None
@@ -159,7 +159,7 @@ def _until_date(arc: Arc, claim: Claim, *, sharable: bool) -> Ns | None:
         if booking.urgent:
             return date
         return max(date, hold.end) if booking.priority >= arc.priority else None
-    # One that was taken up waits from its date on, or runs.
+    # The ARC of a booking that was taken up is queued from its date on, or runs.
     waits = claim.is_taken and claim.arc.held_back is None
     if sharable or waits or booking.priority < arc.priority:
         return None

@@ -1,8 +1,8 @@
 """Votes of sharable RCs: the answers in force, and the open proposals (the query ends after the LATE_VOTE of
 `services/rcm/rcm.py`).
 
-An RC that accepts a set of holders accepts every subset; so a veto holds for every superset, and one answer settles
-many sets. Answers are in force until the RC's rules change."""
+An RC that accepts a set of holders accepts every subset, so a veto also counts for every superset, and an answer
+settles many sets. Answers are in force until the RC's rules change."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from zscout.types import ArcId, Ns, RcName
 HolderSet: TypeAlias = frozenset[ArcId]
 
 ANSWERS_PER_RC = 4096
-"""Older answers are forgotten; the RC is then asked again."""
+"""Older answers are dropped; the RC is asked again if they are needed."""
 PROPOSALS_PER_SET = 8
-"""Open proposals of one set: an unresponsive RC is asked again, and any answer counts."""
+"""Open proposals of a set: an unresponsive RC is asked again, and any answer counts."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,7 +39,7 @@ class RcVotes:
         self.retry_at: Ns = 0  # when an unresponsive RC may be asked again
         self._accepted_with: dict[ArcId, dict[HolderSet, None]] = {}
         self._vetoed_at: dict[ArcId, dict[HolderSet, None]] = {}
-        """Each vetoed set once, under its ARC with the fewest entries: short lists are searched."""
+        """Each vetoed set once, under its ARC with the fewest entries, so that searched lists are short."""
 
     def known(self, holders: HolderSet) -> Answer | None:
         if holders in self.accepted:
@@ -82,7 +82,7 @@ class RcVotes:
             self._drop(holders, self.vetoed, self._vetoed_at)
 
     def rename(self, arc: ArcId, renamed: ArcId) -> list[int]:
-        """Rename an ARC; return the numbers of the open proposals that name it."""
+        """Rename an ARC. Return the numbers of the open proposals that name it."""
         for holders in list(self._accepted_with.get(arc, ())):
             self._drop(holders, self.accepted, self._accepted_with)
             self.accept(_renamed(holders, arc, renamed))
@@ -126,7 +126,7 @@ class Votes:
         """By RC: the sets that it answered or was late for; None: its answers were dropped. `Calendar` empties it."""
 
     def known(self, rc: RcName, holders: HolderSet) -> Answer | None:
-        """The answer in force for exactly this set, direct or implied; None if unknown."""
+        """The answer in force for this set, given or implied; None if unknown."""
         return self._by_rc[rc].known(holders)
 
     def accepts(self, rc: RcName, holders: HolderSet) -> bool:
@@ -141,8 +141,8 @@ class Votes:
         return [rc for rc in self.unresponsive if self._by_rc[rc].retry_at <= now]
 
     def propose(self, rc: RcName, holders: HolderSet, now: Ns) -> int | None:
-        """The number of a new proposal, or None if one is open or the RC is not due: an unresponsive RC is asked
-        once a quantum."""
+        """Return the number of a new proposal; None if the same is open or the RC is not due. An unresponsive RC is
+        asked once a quantum."""
         votes = self._by_rc[rc]
         if rc in self.unresponsive:
             if now < votes.retry_at:
@@ -218,12 +218,12 @@ class Votes:
                 self.proposals[number] = (rc, _renamed(self.proposals[number][1], arc, renamed))
 
     def open(self, rc: RcName) -> int:
-        """How many sets this RC is asked about and not late for."""
+        """The number of sets with an open proposal that is not overdue."""
         votes = self._by_rc[rc]
         return len(votes.proposals) - len(votes.overdue)
 
     def is_asked(self, rc: RcName, holders: HolderSet) -> bool:
-        """Return True if this RC is asked about this set, and not late."""
+        """Return True if a proposal of this set is open and not overdue."""
         votes = self._by_rc[rc]
         return holders in votes.proposals and holders not in votes.overdue
 
