@@ -23,7 +23,7 @@ class ConfirmServer:
         mesh.serve(mesh.keys.confirm_any(mesh.me.host), Confirm, self._on_confirm)
 
     def serve(self, rc: RcName, on_command: Callable[[CommandQuery], None]) -> Declaration:
-        """Include `rc` from now on: `on_command` handles the question as a command, and may raise Refused."""
+        """Confirm grants for `rc` as well: `on_command` handles the query as a command, and may raise Refused."""
         self._rcs[rc] = on_command
 
         def leave() -> None:

@@ -647,7 +647,7 @@ class ResourceController:
             self.publish()
 
     def _waits(self) -> dict[Grant, Ns]:
-        """The longest time until the device has begun, by grant, for holders that wait for it."""
+        """By grant whose device has not begun yet: the longest time until it has."""
         waits: dict[Grant, Ns] = {}
         now, bound = self.mesh.now(), round(self.begin_within * SECOND)
         for grant, entry in self.holds.held.items():

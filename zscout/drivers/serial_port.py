@@ -184,8 +184,8 @@ class SerialPort:
         return getattr(self._port, "_socket", None)
 
     def _bound(self, seconds: float) -> None:
-        """Set how long TCP waits for its peer. While no bytes are under way it must be longer, as a lost probe is not
-        repeated."""
+        """Set how long TCP waits for its peer. While no bytes are sent this must be longer: a lost keepalive probe is
+        not repeated."""
         if self._socket is not None and hasattr(socket, "TCP_USER_TIMEOUT"):
             self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, round(1000 * seconds))
 

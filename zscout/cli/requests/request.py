@@ -414,7 +414,7 @@ def _is_cut(client: Client, arc: OpenArc, left: float) -> bool:
 
 
 def _yours(arc: OpenArc, left: float, longest: Ns | None, *, cut: bool = False) -> str:
-    """How long a hold lasts that is protected for `left` seconds; `longest` as the fleet allows."""
+    """Words for how long a hold lasts: protected for `left` seconds, at most `longest` in all (the fleet's limit)."""
     continues = arc.keep and (longest is None or max(float(arc.min_runtime), round(left)) * SECOND < longest)
     then = _kept(longest, arc.priority) if continues else "given back"
     cause = ", when it is booked or reserved" if cut else ""
