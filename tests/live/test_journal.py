@@ -127,7 +127,7 @@ async def test_what_was_held_is_known_after_a_node_is_killed(tmp_path: Path) -> 
         assert plain[1].split() == ["BEGAN", "HELD", "REQUEST", "WHO", "PRIORITY", "WAITED", "END", "DEVICES"]
         assert [line.split()[-1] for line in plain[2:5]] == ["robot/b"] * 3
         assert "preempted by take" in plain[2]
-        assert "stands" in plain[4]
+        assert "in force" in plain[4]
         rows = [*csv.DictReader(io.StringIO((await lab.zscout("history", "--csv")).stdout))]
         assert [(row["arc"], row["outcome"], row["rcs"]) for row in rows] == [
             ("survey", "preempted", "robot/b"),
