@@ -41,7 +41,7 @@ PLAIN = [
     *("benchmarks", "zscout/__init__.py", "zscout/node.py"),
     *("zscout/keyexpr.py", "zscout/logs.py", "zscout/ports.py", "zscout/streams.py", "zscout/terminal.py"),
     *("zscout/trace.py", "zscout/types.py"),
-    *("zscout/rcm", "zscout/services/rcm"),
+    *("zscout/rcm", "zscout/scheduling", "zscout/services/rcm"),
 ]
 """Folders and files in plain English: docstrings, comments and messages keep the rates of WORN."""
 WORN = {

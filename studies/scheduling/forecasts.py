@@ -20,7 +20,7 @@ from studies.scheduling.trial import STRATEGIES
 from zscout.scheduling.core import Core
 from zscout.scheduling.forecast import forecast
 from zscout.scheduling.model import ArcRequest, Effect, Granted, Hold, HoldEnded, Propose, Queued
-from zscout.scheduling.runtimes import RuntimeEstimator, Wish
+from zscout.scheduling.runtimes import RequestTraits, RuntimeEstimator
 from zscout.simulation.replay import SERVED, replay
 from zscout.simulation.workload import Arrival, Workload
 from zscout.types import SECOND, ArcId, Ns
@@ -116,7 +116,7 @@ def run(job: ForecastJob) -> ForecastTrial:
                     started.setdefault(arc, now)
                     since[arc] = now
                 case HoldEnded(arc=arc, outcome=outcome):
-                    learned.observe(Wish.of(requests[arc]), now - since[arc], whole=outcome in SERVED)
+                    learned.observe(RequestTraits.of(requests[arc]), now - since[arc], whole=outcome in SERVED)
                 case Queued(arc=arc) if arc not in started:
                     queued.setdefault(arc, now)
         if any(isinstance(effect, Propose) for effect in effects):

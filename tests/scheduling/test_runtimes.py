@@ -17,7 +17,7 @@ from zscout.scheduling.booking import Booking
 from zscout.scheduling.core import Core
 from zscout.scheduling.forecast import forecast
 from zscout.scheduling.model import ArcRequest, Effect, Granted, HoldEnded, RcJoined, Released, Requested, Tick
-from zscout.scheduling.runtimes import MAX_KEPT, RuntimeEstimator, Wish
+from zscout.scheduling.runtimes import MAX_KEPT, RequestTraits, RuntimeEstimator
 from zscout.simulation.replay import SERVED, replay
 from zscout.simulation.workload import Workload
 from zscout.types import SECOND, ArcId, Ns
@@ -31,22 +31,22 @@ def request(arc: str, *rcs: str, runtime: Ns = HOUR, name: str = "survey", keep:
     return ArcRequest(arc, "h/c", {rc: {} for rc in rcs or ("robot/a",)}, 0, runtime, keep, name, who=who)
 
 
-def wish(runtime: Ns = HOUR, name: str = "survey", *rcs: str) -> Wish:
-    return Wish.of(request("one", *rcs, runtime=runtime, name=name))
+def traits(runtime: Ns = HOUR, name: str = "survey", *rcs: str) -> RequestTraits:
+    return RequestTraits.of(request("one", *rcs, runtime=runtime, name=name))
 
 
 def taught(*lasted: Ns, runtime: Ns = HOUR) -> RuntimeEstimator:
     estimator = RuntimeEstimator()
     for one in lasted:
-        estimator.observe(wish(runtime), one, whole=True)
+        estimator.observe(traits(runtime), one, whole=True)
     return estimator
 
 
 def test_who_asks_for_an_hour_and_always_takes_ten_minutes_is_expected_to_take_ten() -> None:
     estimator = taught(10 * MINUTE, 10 * MINUTE)
-    assert estimator.runtime(wish()) is None  # too few
-    estimator.observe(wish(), 10 * MINUTE, whole=True)
-    assert estimator.runtime(wish()) == 10 * MINUTE
+    assert estimator.runtime(traits()) is None  # too few
+    estimator.observe(traits(), 10 * MINUTE, whole=True)
+    assert estimator.runtime(traits()) == 10 * MINUTE
 
 
 @pytest.mark.parametrize(("times_too_much", "expected"), [(6, 5 * MINUTE), (1, None)])
@@ -55,8 +55,8 @@ def test_who_asks_for_so_many_times_too_much_is_expected_to_take_that_part(
 ) -> None:
     estimator = RuntimeEstimator()
     for minutes in (1, 7, 20, 3):
-        estimator.observe(wish(times_too_much * minutes * MINUTE), minutes * MINUTE, whole=True)
-    assert estimator.runtime(wish(30 * MINUTE)) == expected
+        estimator.observe(traits(times_too_much * minutes * MINUTE), minutes * MINUTE, whole=True)
+    assert estimator.runtime(traits(30 * MINUTE)) == expected
 
 
 def test_one_who_is_not_to_be_foretold_is_expected_to_take_what_was_asked_for() -> None:
@@ -64,40 +64,40 @@ def test_one_who_is_not_to_be_foretold_is_expected_to_take_what_was_asked_for() 
     random = Random(1)  # noqa: S311 - a test's
     estimator = RuntimeEstimator()
     for _ in range(100):
-        estimator.observe(wish(), random.choice((HOUR, HOUR, HOUR, SECOND)), whole=True)
-    assert estimator.runtime(wish()) is None
+        estimator.observe(traits(), random.choice((HOUR, HOUR, HOUR, SECOND)), whole=True)
+    assert estimator.runtime(traits()) is None
 
 
 def test_what_is_known_of_a_name_serves_for_other_rcs_until_more_is_known() -> None:
     estimator = taught(*[10 * MINUTE] * 3)
-    assert estimator.runtime(wish(HOUR, "survey", "robot/b")) == 10 * MINUTE
+    assert estimator.runtime(traits(HOUR, "survey", "robot/b")) == 10 * MINUTE
     for _ in range(3):
-        estimator.observe(wish(HOUR, "survey", "robot/b"), 20 * MINUTE, whole=True)
-    assert estimator.runtime(wish(HOUR, "survey", "robot/b")) == 20 * MINUTE
-    assert estimator.runtime(wish()) == 10 * MINUTE
+        estimator.observe(traits(HOUR, "survey", "robot/b"), 20 * MINUTE, whole=True)
+    assert estimator.runtime(traits(HOUR, "survey", "robot/b")) == 20 * MINUTE
+    assert estimator.runtime(traits()) == 10 * MINUTE
 
 
 def test_nothing_is_known_of_another_program() -> None:
-    assert taught(*[10 * MINUTE] * 3).runtime(wish(HOUR, "another")) is None
-    assert taught(*[10 * MINUTE] * 3).runtime(wish()._replace(command="another")) is None
+    assert taught(*[10 * MINUTE] * 3).runtime(traits(HOUR, "another")) is None
+    assert taught(*[10 * MINUTE] * 3).runtime(traits()._replace(command="another")) is None
 
 
 def test_a_hold_that_was_taken_away_would_have_lasted_longer() -> None:
     estimator = taught(10 * MINUTE, 10 * MINUTE, 30 * MINUTE, 30 * MINUTE, 30 * MINUTE)
     for _ in range(5):
-        estimator.observe(wish(), 5 * MINUTE, whole=False)
+        estimator.observe(traits(), 5 * MINUTE, whole=False)
     # Not 5, nor the 10 that half of all of them reached.
-    assert estimator.runtime(wish()) == 30 * MINUTE
+    assert estimator.runtime(traits()) == 30 * MINUTE
     for _ in range(MAX_KEPT):
-        estimator.observe(wish(), 5 * MINUTE, whole=False)
-    assert estimator.runtime(wish()) is None
+        estimator.observe(traits(), 5 * MINUTE, whole=False)
+    assert estimator.runtime(traits()) is None
 
 
 def test_what_lasts_already_is_expected_to_last_as_those_that_lasted_so_long() -> None:
     estimator = taught(*[10 * MINUTE] * 5, *[30 * MINUTE] * 3)
-    assert estimator.runtime(wish()) == 10 * MINUTE
-    assert estimator.runtime(wish(), 10 * MINUTE) == 30 * MINUTE
-    outlasts = estimator.runtime(wish(), 40 * MINUTE)
+    assert estimator.runtime(traits()) == 10 * MINUTE
+    assert estimator.runtime(traits(), 10 * MINUTE) == 30 * MINUTE
+    outlasts = estimator.runtime(traits(), 40 * MINUTE)
     assert outlasts is not None
     assert 40 * MINUTE < outlasts < 50 * MINUTE
 
@@ -136,8 +136,8 @@ def test_an_estimate_is_longer_than_what_has_passed(
 ) -> None:
     estimator = RuntimeEstimator()
     for runtime, lasted, whole in seen:
-        estimator.observe(wish(runtime), lasted, whole=whole)
-    expected = estimator.runtime(wish(asked), elapsed)
+        estimator.observe(traits(runtime), lasted, whole=whole)
+    expected = estimator.runtime(traits(asked), elapsed)
     assert expected is None or expected > elapsed
 
 
@@ -145,16 +145,16 @@ def test_memory_is_bounded() -> None:
     estimator = RuntimeEstimator(most=30)
     for number in range(1_000):
         for _ in range(2):
-            estimator.observe(wish(HOUR, f"n{number}" * 1_000), MINUTE, whole=True)
+            estimator.observe(traits(HOUR, f"n{number}" * 1_000), MINUTE, whole=True)
     histories = estimator._histories
     assert len(histories) == 30
     assert all(len(one.spans) <= MAX_KEPT for one in histories.values())
     assert len(repr(histories.keys())) < 30 * 1_000
     # What is used stays.
     for number in range(100):
-        estimator.observe(wish(HOUR, "used"), MINUTE, whole=True)
-        estimator.observe(wish(HOUR, f"m{number}"), HOUR, whole=True)
-    assert estimator.runtime(wish(HOUR, "used")) == MINUTE
+        estimator.observe(traits(HOUR, "used"), MINUTE, whole=True)
+        estimator.observe(traits(HOUR, f"m{number}"), HOUR, whole=True)
+    assert estimator.runtime(traits(HOUR, "used")) == MINUTE
 
 
 @settings(max_examples=times(25))
@@ -182,7 +182,7 @@ def test_what_was_learned_ends_no_hold_and_touches_no_decision(workload: Workloa
                 since[effect.arc] = effect.start
             elif isinstance(effect, HoldEnded):
                 lasted = now - since[effect.arc]
-                estimator.observe(Wish.of(requests[effect.arc]), lasted, whole=effect.outcome in SERVED)
+                estimator.observe(RequestTraits.of(requests[effect.arc]), lasted, whole=effect.outcome in SERVED)
         told = forecast(core, now, runtimes=estimator)
         assert all(start >= now for start in told.starts.values())
 

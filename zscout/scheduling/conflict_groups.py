@@ -50,7 +50,7 @@ class _Search:
         self._heap: list[
             tuple[Rank, int, Arc, Watched | None]
         ] = []  # candidates, each by itself or as a watcher of an RC
-        self._called: set[Watched] = set()  # RCs and classes with a watcher in the heap
+        self._walked: set[Watched] = set()  # RCs and classes with a watcher in the heap
         self._started: Counter[str] = Counter()  # by owner with a quota: ARCs that might start
         self._taken: Counter[str] = Counter()  # by owner with a quota: RCs of these ARCs
         self.awaiting_votes = 0  # bits of the RCs of ARCs that wait for a vote on a reservation
@@ -60,7 +60,7 @@ class _Search:
         index = self.state.index
         self._heap = [(arc.rank, 0, arc, None) for arc in (*index.ready.values(), *index.parked.values())]
         heapq.heapify(self._heap)
-        self._call_watchers(index.freed | union(self.state.rc(name).bit for name in self.votes.invalidated), None)
+        self._queue_watchers(index.freed | union(self.state.rc(name).bit for name in self.votes.invalidated), None)
         found: list[Arc] = []
         last: Rank | None = None
         while self._heap:
@@ -75,16 +75,16 @@ class _Search:
                 self._note_preemptible(arc)
             last = rank
             if on is not None:
-                self._call_next_watcher(on, rank)
+                self._queue_next_watcher(on, rank)
         return [*found, *self.preemptible.values()]
 
-    def _call_watchers(self, bits: int, rank: Rank | None) -> None:
+    def _queue_watchers(self, bits: int, rank: Rank | None) -> None:
         for on in self.state.watched_at(bits):
-            if on not in self._called:
-                self._called.add(on)
-                self._call_next_watcher(on, rank)
+            if on not in self._walked:
+                self._walked.add(on)
+                self._queue_next_watcher(on, rank)
 
-    def _call_next_watcher(self, on: Watched, rank: Rank | None) -> None:
+    def _queue_next_watcher(self, on: Watched, rank: Rank | None) -> None:
         following = self.state.next_watcher(on, rank)
         if following is not None:
             heapq.heappush(self._heap, following)
@@ -140,7 +140,7 @@ class _Search:
             for holder in rc.holders.values():
                 if holder.id not in self.preemptible and holder.preemptible_by(arc, self.state.now):
                     self.preemptible[holder.id] = holder
-                    self._call_watchers(holder.mask, arc.rank)
+                    self._queue_watchers(holder.mask, arc.rank)
 
 
 def conflict_groups(

@@ -123,7 +123,7 @@ class _DryRun:
         state, index, heap = self.state, self.state.index, self._heap
         heap += [(arc.rank, 0, arc, None) for arc in (*index.ready.values(), *index.parked.values())]
         heapq.heapify(heap)
-        self._call(index.freed | union(state.rc(name).bit for name in state.votes.invalidated), None)
+        self._queue_watchers(index.freed | union(state.rc(name).bit for name in state.votes.invalidated), None)
         last: Rank | None = None
         while heap:
             rank, _, arc, on = heapq.heappop(heap)
@@ -135,15 +135,15 @@ class _DryRun:
                 self._check(arc)
             last = rank
             if on is not None:
-                self._call_next(on, rank)
+                self._queue_next_watcher(on, rank)
 
-    def _call(self, bits: int, rank: Rank | None) -> None:
+    def _queue_watchers(self, bits: int, rank: Rank | None) -> None:
         for on in self.state.watched_at(bits):
             if on not in self._walked:
                 self._walked.add(on)
-                self._call_next(on, rank)
+                self._queue_next_watcher(on, rank)
 
-    def _call_next(self, on: Watched, rank: Rank | None) -> None:
+    def _queue_next_watcher(self, on: Watched, rank: Rank | None) -> None:
         following = self.state.next_watcher(on, rank)
         if following is None:
             self._walked.discard(on)
@@ -205,7 +205,7 @@ class _DryRun:
             self._end(victim)
         self._start(arc)
         for victim in victims:
-            self._call(victim.mask, arc.rank)
+            self._queue_watchers(victim.mask, arc.rank)
 
     def _end(self, arc: Arc) -> None:
         """End a hold; its ARC may restart on other RCs by its patterns."""

@@ -148,7 +148,7 @@ class Pass:
                 if arc.footprint is None or not self._still_deferred(arc, arc.footprint):
                     self._check(arc)
             if on is not None:
-                self._call_next_watcher(on, last)
+                self._queue_next_watcher(on, last)
         # ARCs checked before a change of this pass have not seen it.
         self.index.touched |= self._changed_here
 
@@ -272,7 +272,7 @@ class Pass:
         new = footprint & ~self.off_limits
         if new:
             self.off_limits |= new
-            self._call_concerned(new, new, rank)
+            self._queue_affected(new, new, rank)
 
     def _take_votes(self) -> None:
         index, votes, rc = self.index, self.votes, self.state.rc
@@ -290,21 +290,21 @@ class Pass:
         freed, touched = index.freed, index.freed | index.touched
         index.freed = index.touched = 0
         self.changed |= touched
-        self._call_concerned(freed, touched, rank)
+        self._queue_affected(freed, touched, rank)
         return touched
 
-    def _call_concerned(self, watched: int, touched: int, rank: Rank | None) -> None:
+    def _queue_affected(self, watched: int, touched: int, rank: Rank | None) -> None:
         index = self.index
         for on in self.state.watched_at(watched):
             if on not in self._walked:
                 self._walked.add(on)
-                self._call_next_watcher(on, rank)
+                self._queue_next_watcher(on, rank)
         for arc in [arc for arc in index.parked.values() if (arc.footprint or 0) & touched]:
             if rank is None or arc.rank > rank:
                 index.put(arc, ArcState.READY)
                 heapq.heappush(self._heap, (arc.rank, 0, arc, None))
 
-    def _call_next_watcher(self, on: Watched, rank: Rank | None) -> None:
+    def _queue_next_watcher(self, on: Watched, rank: Rank | None) -> None:
         following = self.state.next_watcher(on, rank)
         if following is None:
             self._walked.discard(on)

@@ -32,14 +32,14 @@ MIN_JUDGED: Final = 2
 TOLERANCE: Final = 1e-9
 
 
-class Wish(NamedTuple):
+class RequestTraits(NamedTuple):
     name: str
     command: str
     needs: frozenset[Need]
     runtime: Ns
 
     @classmethod
-    def of(cls, request: ArcRequest) -> Wish:
+    def of(cls, request: ArcRequest) -> RequestTraits:
         command = "" if request.who is None else request.who.command
         return cls(request.name, command, frozenset(request.needs), request.min_runtime)
 
@@ -56,27 +56,27 @@ class RuntimeEstimator:
         self._most = most
         self._histories: OrderedDict[Hashable, _History] = OrderedDict()
 
-    def observe(self, wish: Wish, lasted: Ns, *, whole: bool) -> None:
+    def observe(self, traits: RequestTraits, lasted: Ns, *, whole: bool) -> None:
         """Record a hold. `whole`: released, or ran its requested time; else cut short."""
-        for key in wish.histories():
+        for key in traits.histories():
             history = self._histories.setdefault(key, _History())
             self._histories.move_to_end(key)
-            history.add(_Span(wish.runtime, max(1, lasted), whole))
+            history.add(_Span(traits.runtime, max(1, lasted), whole))
         while len(self._histories) > self._most:
             self._histories.popitem(last=False)
 
-    def runtime(self, wish: Wish, elapsed: Ns = 0) -> Ns | None:
+    def runtime(self, traits: RequestTraits, elapsed: Ns = 0) -> Ns | None:
         """The expected length of a hold that has lasted `elapsed` ns, always more than that. None: no better guess than
         the requested time."""
-        for key in wish.histories():
+        for key in traits.histories():
             history = self._histories.get(key)
             if history is not None and (estimate := history.estimate()) is not None:
-                return estimate.runtime(wish.runtime, max(0, elapsed))
+                return estimate.runtime(traits.runtime, max(0, elapsed))
         return None
 
     def end(self, request: ArcRequest, hold: Hold, now: Ns) -> Ns | None:
         """The likely release of a hold, after `now` and before its end. None: unknown."""
-        runtime = self.runtime(Wish.of(request), now - hold.start)
+        runtime = self.runtime(RequestTraits.of(request), now - hold.start)
         if runtime is None:
             return None
         end = max(hold.start + runtime, now + 1)

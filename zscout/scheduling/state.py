@@ -173,7 +173,7 @@ class SchedulerState:
         self.present |= rc.bit
         self.sharable = self.sharable | rc.bit if sharable else self.sharable & ~rc.bit
         self.index.freed |= rc.bit
-        self._grow(rc.bit)
+        self._note_change(rc.bit)
 
     def leave(self, name: RcName) -> None:
         rc = self.rc(name)
@@ -183,7 +183,7 @@ class SchedulerState:
         self.present &= ~rc.bit
         self.unwell &= ~rc.bit
         self.index.freed |= rc.bit
-        self._grow(rc.bit)
+        self._note_change(rc.bit)
 
     def set_unwell(self, name: RcName, why: str) -> None:
         rc = self.rc(name)
@@ -192,7 +192,7 @@ class SchedulerState:
         if unwell != self.unwell:
             self.unwell = unwell
             self.index.freed |= rc.bit
-            self._grow(rc.bit)
+            self._note_change(rc.bit)
 
     def open_to(self, priority: int) -> int:
         """Bits of the RCs that a request of this priority may be granted."""
@@ -219,40 +219,40 @@ class SchedulerState:
     def enter(self, arc: Arc) -> None:
         """Add a new ARC that starts at once, without being queued."""
         arc.rcs = tuple(self.rcs_in(arc.mask))
-        self._know(arc)
+        self._register(arc)
         self._at_place[arc.place] = arc
 
     def enqueue(self, arc: Arc, since: Ns) -> None:
         arc.since, arc.entry = since, self._next_entry()
         arc.rcs = arc.rcs or tuple(self.rcs_in(arc.mask))
-        self._know(arc)
+        self._register(arc)
         if not self._is_first(arc):
             arc.move_to(ArcState.HELD_BACK)
             self.held_back[arc.id] = arc
             return
         self.queued[arc.id] = arc
         if self.shares is not None:
-            self._put(arc, self.shares)
+            self._reposition(arc, self.shares)
         if arc.patterns:
             self.by_pattern[arc.id] = arc
             self._classify(arc)
         self._count_demand(arc, 1)
         self.index.add(arc)
-        self.index.contended |= self._wanted(arc)
+        self.index.contended |= self._wanted_mask(arc)
 
     def dequeue(self, arc: Arc) -> None:
         if self.held_back.pop(arc.id, None) is not None:
             arc.held_back = None
             return
         del self.queued[arc.id]
-        self.index.contended |= self._wanted(arc)
+        self.index.contended |= self._wanted_mask(arc)
         self._count_demand(arc, -1)
         self.index.remove(arc)
         if arc.patterns:
             del self.by_pattern[arc.id]
             self._declassify(arc)
 
-    def _wanted(self, arc: Arc) -> int:
+    def _wanted_mask(self, arc: Arc) -> int:
         """Bits of the RCs that a queued ARC names or that match its patterns."""
         return arc.named_mask if arc.like is None else arc.named_mask | arc.like.reach
 
@@ -325,18 +325,18 @@ class SchedulerState:
 
     def forget(self, arc: Arc) -> None:
         arc.move_to(ArcState.ENDED)
-        self._forget_client(arc)
+        self._unregister(arc)
         self.leave_place(arc)
 
     def voter(self, arc: ArcId) -> Arc | None:
         """The ARC, or the booking's placeholder, that has this id in a set of holders."""
         return self.arc(arc) or (self.claims[arc].arc if arc in self.claims else None)
 
-    def _know(self, arc: Arc) -> None:
+    def _register(self, arc: Arc) -> None:
         self._clients.setdefault(arc.request.client, {})[arc.id] = arc
         self._owners.setdefault(arc.owner, {})[arc.id] = arc
 
-    def _forget_client(self, arc: Arc) -> None:
+    def _unregister(self, arc: Arc) -> None:
         for known, of in ((self._clients, arc.request.client), (self._owners, arc.owner)):
             del known[of][arc.id]
             if not known[of]:
@@ -362,10 +362,10 @@ class SchedulerState:
         for end in (arc.hold.end, arc.hold.last):
             if end is not None and end > self.now:
                 heapq.heappush(self._ends, (end, arc.id))
-        self._know(arc)
+        self._register(arc)
 
     def _rename(self, arc: Arc, client: ClientId, name: ArcId) -> None:
-        self._forget_client(arc)
+        self._unregister(arc)
         who = arc.request.who
         if who is not None and who.host:
             who = structs.replace(who, host="")  # from now on the new client's host
@@ -405,14 +405,14 @@ class SchedulerState:
                 heapq.heappush(self._ends, (end, arc.id))
         self.index.freed |= arc.mask
         self.index.contended |= arc.mask
-        self._grow(arc.mask, max(before, arc.known_end()))
+        self._note_change(arc.mask, max(before, arc.known_end()))
 
     def set_begin_within(self, name: RcName, begin_within: Ns | None) -> None:
         rc = self.rc(name)
         if rc.begin_within != begin_within:
             rc.begin_within = begin_within
             self.index.freed |= rc.bit
-            self._grow(rc.bit)
+            self._note_change(rc.bit)
 
     def expired_arcs(self) -> Iterator[Arc]:
         """Yield the running ARCs whose minimum or longest runtime is over, once each. The caller may end others
@@ -439,9 +439,9 @@ class SchedulerState:
     def min_runtime_over(self, arc: Arc) -> None:
         """Note that equal priorities may preempt this kept hold from now on."""
         self.index.freed |= arc.mask
-        self._grow(arc.mask, 0)
+        self._note_change(arc.mask, 0)
 
-    def _grow(self, mask: int, until: float = math.inf) -> None:
+    def _note_change(self, mask: int, until: float = math.inf) -> None:
         self.version += 1
         for bit in bits(mask):
             self.changed[bit] = max(until, self.changed.get(bit, 0))
@@ -457,14 +457,14 @@ class SchedulerState:
 
     def order_groups(self) -> None:
         if self.shares is not None and self.shares.order():
-            self._put_all(self.shares)
+            self._reposition_all(self.shares)
 
     def take_policy(self, policy: SchedulingPolicy) -> None:
         charged, same = self.charged(), policy.fair_shares == self.policy.fair_shares
         patient = policy.patience == self.policy.patience
         if policy.operator_priority != self.policy.operator_priority:
             self.index.freed |= self.unwell
-            self._grow(self.unwell)
+            self._note_change(self.unwell)
         for arc in self.by_pattern.values():  # the set of barred RCs may have changed
             self.index.put(arc, ArcState.READY)
             self._declassify(arc)
@@ -476,7 +476,7 @@ class SchedulerState:
                 arc.patience = self.patience
         if same:
             if not patient:
-                self._put_all(self.shares)
+                self._reposition_all(self.shares)
             return
         self.shares = None if policy.fair_shares is None else Shares(self, policy.fair_shares)
         if self.shares is not None:
@@ -486,11 +486,11 @@ class SchedulerState:
             for arc in self.running.values():
                 self.shares.hold(arc)
             self.shares.order()
-        self._put_all(self.shares)
+        self._reposition_all(self.shares)
 
-    def _put_all(self, shares: Shares | None) -> None:
+    def _reposition_all(self, shares: Shares | None) -> None:
         for arc in self.queued.values():
-            self._put(arc, shares)
+            self._reposition(arc, shares)
         self.index.sort(self.queued, self.rcs_in(self.index.watched))
         for like in self.classes.values():
             like.members = sorted(self.queued[rank[-1]].rank for rank in like.members)
@@ -498,7 +498,7 @@ class SchedulerState:
             rc.demand = sorted(self.queued[rank[-1]].rank for rank in rc.demand)
         self.demand_version += 1
 
-    def _put(self, arc: Arc, shares: Shares | None) -> None:
+    def _reposition(self, arc: Arc, shares: Shares | None) -> None:
         arc.put_at(0 if shares is None else shares.position(arc))
         fair = self.policy.fair_shares if self.policy.patience is not None else None
         arc.late = max(0, fair.patience - arc.patience) if arc.position and fair is not None else 0
@@ -570,7 +570,7 @@ class SchedulerState:
     def _add_running(self, arc: Arc) -> None:
         self.running[arc.id] = arc
         self.running_by_pattern += bool(arc.patterns)
-        self._grow(arc.mask, arc.known_end())
+        self._note_change(arc.mask, arc.known_end())
         if arc.claim is not None:
             self.dates.put(arc.claim)
         self.running_by_owner[arc.owner] = self.running_by_owner.get(arc.owner, 0) + 1
@@ -585,7 +585,7 @@ class SchedulerState:
             self.shares.end(arc)
         del self.running[arc.id]
         self.running_by_pattern -= bool(arc.patterns)
-        self._grow(arc.mask, arc.known_end())
+        self._note_change(arc.mask, arc.known_end())
         self.running_by_owner[arc.owner] -= 1
         self.held_by_owner[arc.owner] -= len(arc.rcs)
         if not self.running_by_owner[arc.owner]:

@@ -15,7 +15,7 @@ from tests.services.journal.kit import holder, over, past, published
 from tests.services.rcm.kit import FakeClient, FakeFleet, request
 from zscout.config.node import JournalConfig
 from zscout.messages import Cancel, ReasonInfo, Release, Who
-from zscout.scheduling.runtimes import Wish
+from zscout.scheduling.runtimes import RequestTraits
 from zscout.services.journal.follower import Change, HoldOver, HoldSeen
 from zscout.services.journal.journal import Journal
 from zscout.services.journal.store import JournalStore
@@ -102,8 +102,8 @@ async def test_one_who_starts_anew_knows_what_its_journal_knows(tmp_path: Path) 
         await mesh.close()
 
 
-def wish(need: str, asked: int = 60) -> Wish:
-    return Wish("survey", "./survey.py", frozenset({need}), asked * SECOND)
+def wish(need: str, asked: int = 60) -> RequestTraits:
+    return RequestTraits("survey", "./survey.py", frozenset({need}), asked * SECOND)
 
 
 def tell(

@@ -10,7 +10,7 @@ from typing import Final, NamedTuple
 from zscout.messages import Grants, Holder, PastHold, ReasonInfo, Who, duration
 from zscout.scheduling.model import Outcome
 from zscout.scheduling.reason import ReasonCode
-from zscout.scheduling.runtimes import RuntimeEstimator, Wish
+from zscout.scheduling.runtimes import RequestTraits, RuntimeEstimator
 from zscout.types import SECOND, Grant, Ns
 
 MAX_OPEN: Final = 20_000
@@ -18,7 +18,7 @@ MAX_OPEN: Final = 20_000
 
 
 class _Begun(NamedTuple):
-    wish: Wish
+    traits: RequestTraits
     at: Ns
 
 
@@ -36,7 +36,7 @@ class RuntimeObserver:
         for revoked in grants.revoked:
             begun = self._open.pop(revoked.grant, None)
             if begun is not None:
-                self._end(begun.wish, now - begun.at, revoked.outcome, revoked.why)
+                self._end(begun.traits, now - begun.at, revoked.outcome, revoked.why)
 
     def recall(self, holds: Iterable[PastHold]) -> None:
         """Learn from the holds in a journal, given with the oldest first."""
@@ -44,9 +44,9 @@ class RuntimeObserver:
             if hold.ended is not None and hold.min_runtime is not None and not hold.late and hold.rcs:
                 asked = round(hold.min_runtime * SECOND)
                 if asked > 0:
-                    wish = _wish(hold.arc, hold.who, hold.rcs, asked)
+                    traits = _traits(hold.arc, hold.who, hold.rcs, asked)
                     why = ReasonInfo(hold.code, own=hold.own) if hold.code else None
-                    self._end(wish, round((hold.ended - hold.began) * SECOND), hold.outcome, why)
+                    self._end(traits, round((hold.ended - hold.began) * SECOND), hold.outcome, why)
 
     def _begin(self, now: Ns, holder: Holder) -> None:
         try:
@@ -55,25 +55,25 @@ class RuntimeObserver:
             return
         patterns = {rc: need for need, rc in holder.bound.items()}
         needs = [patterns.get(rc, rc) for rc in holder.rcs]
-        wish = _wish(holder.arc, holder.who, needs, asked)
+        traits = _traits(holder.arc, holder.who, needs, asked)
         # A hold that is seen late, or that continues under a new grant, began earlier: by the part of its minimum
         # runtime that is used up.
         runtime = asked if holder.runtime is None else round(holder.runtime * SECOND)
-        self._open[holder.grant] = _Begun(wish, now - max(0, runtime - round(holder.remaining * SECOND)))
+        self._open[holder.grant] = _Begun(traits, now - max(0, runtime - round(holder.remaining * SECOND)))
         if len(self._open) > MAX_OPEN:
             self._open.popitem(last=False)
 
-    def _end(self, wish: Wish, lasted: Ns, outcome: str, why: ReasonInfo | None) -> None:
+    def _end(self, traits: RequestTraits, lasted: Ns, outcome: str, why: ReasonInfo | None) -> None:
         unknown = why is None and outcome in (Outcome.COMPLETED, Outcome.RELEASED)  # of an older version
         if outcome == Outcome.HANDED_OVER or lasted < 0 or unknown:
             return
         expired = why is not None and why.code == ReasonCode.EXPIRED
         given_back = why is not None and why.code == ReasonCode.RELEASED and why.own
         if expired:
-            lasted = wish.runtime  # exactly: the rest is the latency of publications
+            lasted = traits.runtime  # exactly: the rest is the latency of publications
         # Whole: the program had all the time that it wanted, or had requested.
-        self.estimator.observe(wish, lasted, whole=expired or given_back)
+        self.estimator.observe(traits, lasted, whole=expired or given_back)
 
 
-def _wish(arc: str, who: Who | None, needs: Iterable[str], asked: Ns) -> Wish:
-    return Wish(arc, "" if who is None else who.command, frozenset(needs), asked)
+def _traits(arc: str, who: Who | None, needs: Iterable[str], asked: Ns) -> RequestTraits:
+    return RequestTraits(arc, "" if who is None else who.command, frozenset(needs), asked)
