@@ -527,7 +527,7 @@ class Roster:
     def _replace_instance(self, rc: _Rc, token: Token) -> None:
         """A new instance on the same host replaces its predecessor."""
         rc.joined, rc.named = None, (token.instance, token.host)
-        self._out.events.append(RcLost(token.name, "it started anew"))
+        self._out.events.append(RcLost(token.name, "it restarted"))
         self._out.then.append(Name(token.name))
 
     def _lose_rc(self, name: RcName, why: str = "") -> None:

@@ -313,7 +313,7 @@ class Core:
                 self._votes.overdue(proposal, self._state.now)
             case model.RcJoined(rc, sharable, host, begin_within, unwell):
                 if self._state.rc(rc).present:
-                    self._lose_rc(rc, "it started anew")
+                    self._lose_rc(rc, "it restarted")
                 self._state.set_begin_within(rc, begin_within)
                 self._state.join(rc, sharable=sharable, host=host)
                 self._state.set_unwell(rc, unwell)
