@@ -6,6 +6,7 @@ import random
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from fractions import Fraction
+from functools import partial
 
 import pytest
 from msgspec import structs
@@ -129,7 +130,7 @@ def test_nobody_waits_longer_than_promised_beside_commands(seeds: Sequence[int])
     tried, longer = 0, 0
     for seed in seeds:
         draw = random.Random(f"commands {seed}")  # noqa: S311
-        work = changed(workload(seed), lambda one, draw=draw: as_command(one, draw))
+        work = changed(workload(seed), partial(as_command, draw=draw))
         played = replay(work, strategy=Adaptive(), policy=POLICY)
         tried += check_bound(work, played, PATIENCE)
         runtime = {one.request.arc: one.request.min_runtime for one in work.arrivals if one.request.until_done}
