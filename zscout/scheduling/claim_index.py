@@ -1,4 +1,4 @@
-"""Active bookings by id, date and RC: finds the bookings of a time span without a scan of all."""
+"""Active bookings by id, date and RC; the bookings of a time span are found without a scan of all."""
 
 from __future__ import annotations
 

@@ -223,7 +223,7 @@ class Shares:
 
 
 def _change_count(waiting: Counter[tuple[str, int]], waiter: tuple[str, int], by: int) -> bool:
-    """Change the count of waiting ARCs of a group and priority. Return True if it begins or ends by this."""
+    """Change the count of waiting ARCs of a group and priority. Return True if it becomes zero or was zero."""
     waiting[waiter] += by
     if waiting[waiter] == 0:
         del waiting[waiter]

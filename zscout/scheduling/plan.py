@@ -218,7 +218,7 @@ class _DryRun:
         self._leave(arc)
 
     def _drop(self, arcs: Iterable[Arc]) -> None:
-        """Note the ARCs granted at this instant among these, which end or would end after a veto."""
+        """These ARCs end, or would after a veto: note the ones granted at this instant."""
         self._dropped |= {arc.id for arc in arcs if arc.hold is not None and arc.hold.start == self.state.now}
 
     def _start(self, arc: Arc) -> None:

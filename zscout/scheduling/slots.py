@@ -170,7 +170,7 @@ class _Search:
         return None if chosen is None else {need: rc.name for need, rc in chosen.items()}
 
     def _is_free(self, rc: Rc, start: Ns) -> bool | HolderSet:
-        """Whether `rc` is free from `start` for long enough; a set of holders: the vote on it decides."""
+        """Return whether `rc` is free from `start` for long enough, or a set of holders if the vote on it decides."""
         end = start + self._wanted.runtime
         spans, over = self._taken[rc.bit], self._over[rc.bit]
         while over < len(spans) and spans[over].end <= start:
