@@ -304,7 +304,7 @@ class PlacementState:
         self.timers.set(TimerKind.LIFECYCLE, component, None)
 
     def note_incarnation(self, component: ComponentId, incarnation: Incarnation) -> bool:
-        """Keep the next incarnation higher. False: impossible, and ignored."""
+        """Remember this incarnation, so that the next is higher. Return False, and ignore it, if it is impossible."""
         if incarnation > self._highest:
             return False
         if incarnation > self._incarnations.get(component, self._lowest):

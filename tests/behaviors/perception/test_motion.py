@@ -280,7 +280,7 @@ def test_what_is_no_picture_is_refused() -> None:
     shapes = (120, 160, 4), (0, 160), (7, 160), (8, MAX_SIDE + 1), (160,)
     planes: list[Any] = [np.zeros(shape, np.uint8) for shape in shapes]
     for picture in (*planes, np.zeros((120, 160), np.float32), np.zeros((120, 160), np.uint16)):
-        with pytest.raises(ValueError, match="no picture"):
+        with pytest.raises(ValueError, match="not a picture"):
             MotionDetector().see(0.0, picture)
 
 
