@@ -147,7 +147,7 @@ async def test_a_persons_program_follows_the_fleet_file(lab: ClosedLab) -> None:
     lab.node("anvil", "robot/a")
     ada = await lab.person("ada")
     await lab.ready(ada, "robot/a")
-    door = ada.mesh._door  # type: ignore[attr-defined]
+    door = ada.mesh._admission  # type: ignore[attr-defined]
 
     async def members() -> set[str]:
         return {member.name for member in door.security.members}
