@@ -221,5 +221,5 @@ def test_old_recordings_are_removed_whatever_else_lies_there(tmp_path: Path) -> 
 
 @pytest.mark.parametrize("line", [b"", b"{}", b"\xff", b"[" * 100_000, b'{"fleet":' + b"9" * 5_000 + b"}", b"\0"])
 def test_a_recorder_that_is_given_no_job_says_so(line: bytes) -> None:
-    with pytest.raises(BadInput, match="no job for a recorder"):
+    with pytest.raises(BadInput, match="not a job of the recorder"):
         decode_job(line)

@@ -144,7 +144,7 @@ QUERIES: list[tuple[str, str, bytes | None, str, str]] = [
     ("RC state: a promise in words", "rc/robot/a/state", b'{"promise":"me"}', "malformed", "at `$.promise`"),
     ("RC state: an old promise", "rc/robot/a/state", b'{"promise":[0,"x"]}', "old_term", "has promised to obey term"),
     ("RC state: a negative one", "rc/robot/a/state", b'{"promise":[-1,"x"]}', "old_term", "has promised to obey term"),
-    ("RC state: an absurd promise", "rc/robot/a/state", b'{"promise":[%d,""]}' % HIGH, "old_term", "obeys"),
+    ("RC state: an absurd promise", "rc/robot/a/state", b'{"promise":[%d,""]}' % HIGH, "old_term", "promised to obey"),
 ]  # fmt: skip
 
 

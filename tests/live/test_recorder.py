@@ -340,7 +340,7 @@ async def test_bad_settings_are_one_line_and_code_2(tmp_path: Path) -> None:
                 "recordings can't be written to": encode_job(
                     RecorderJob(RecorderConfig(tmp_path / "file" / "runs", "127.0.0.1", 0), lab.fleet_of("a"), "a")
                 ),
-                "no job for a recorder": b'{"recorder": 1}\n',
+                "not a job of the recorder": b'{"recorder": 1}\n',
             }
             for line, job in jobs.items():
                 process = run_recorder(lab, job)
