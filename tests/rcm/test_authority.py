@@ -264,3 +264,10 @@ def test_a_command_is_protected_as_the_fleet_and_its_role_allow(
     tmp_path: Path, text: str, min_runtime: int, until_done: int
 ) -> None:
     assert authority(tmp_path, text).until_done("bob", min_runtime * SECOND) == until_done * SECOND
+
+
+def test_a_reload_changes_how_long_commands_are_protected(tmp_path: Path) -> None:
+    known = authority(tmp_path, "")
+    (tmp_path / "fleet.toml").write_text("[fleet]\ncommand_min_runtime = 600")
+    known.reload(load_fleet(tmp_path / "fleet.toml"))
+    assert known.until_done("bob", 60 * SECOND) == 600 * SECOND
