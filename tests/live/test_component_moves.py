@@ -177,7 +177,7 @@ async def test_a_move_that_fails_before_the_commit_changes_nothing(tmp_path: Pat
         await hosts.start("b", "c", "still", incarnation=2, standby=True)
         assert "no checkpoint() and restore()" in await fails("b", 2)
         await hosts.stop("b", "c")
-        assert "it is ended here" in await fails("b", 2)
+        assert "it is ended on this host" in await fails("b", 2)
         await hosts.start("b", "c", "restless", {"broken": True}, incarnation=3, standby=True)
         assert "this state is rotten" in await fails("b", 3)
         assert (await hosts.ended("b", "c")).ended == "failed"
