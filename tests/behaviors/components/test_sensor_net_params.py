@@ -23,6 +23,7 @@ SHARED: list[tuple[dict[str, Any], str]] = [
     ({"framegrabber": ["framegrabber/fgrab1"]}, "is a list;"),
     ({"framegrabber": "framegrabber/a/b"}, '"framegrabber/a/b" is not a framegrabber;'),
     ({"framegrabber": "framegrabber/"}, '"framegrabber/" is not a framegrabber;'),
+    ({"framegrabber": "radio/*"}, '"radio/*" is needed already, as the radio; name another device'),
     ({"command_rate": 0}, "is 0; write a number from 0.5 to 50"),
     ({"command_rate": 50.1}, "is 50.1; write a number from 0.5 to 50"),
     ({"command_rate": "5"}, 'is the text "5";'),
@@ -101,6 +102,12 @@ def test_what_is_asked_for_reaches_the_behaviors() -> None:
         "framegrabber/*": {},
     }
     assert (one.root.slots.of("hide"), one.root.slots.of("watch")) == ((2, 5.0), (-3, 2.5))
+
+
+def test_a_camera_may_have_a_name_of_any_kind() -> None:
+    net = PlaceRobotComponent(ONE | {"framegrabber": "camera/*"})
+    assert isinstance(net.root, PlaceRobot)
+    assert net.root.needs.framegrabber == "camera/*"
 
 
 def test_each_robot_of_a_net_is_placed_with_what_the_net_was_told() -> None:

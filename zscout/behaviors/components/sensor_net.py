@@ -45,11 +45,16 @@ class SharedParams(Struct, kw_only=True):
     def needs(self, robot: str) -> RobotNeeds:
         """Raises BadInput."""
         check_rc_name(robot, PARAMS / "robot", "robot")
-        for kind, need in (("radio", self.radio), ("video", self.video), ("framegrabber", self.framegrabber)):
+        for name, need in (("radio", self.radio), ("video", self.video), ("framegrabber", self.framegrabber)):
+            kind = "" if name == "framegrabber" else f"{name}/"  # a camera may have a name of any kind
             with suppress(BadName):
-                if check_need(need).startswith(f"{kind}/"):
+                if check_need(need).startswith(kind):
                     continue
-            raise (PARAMS / kind).bad(f"{quoted(need)} is not a {kind}", f'name one, or a pattern, as in "{kind}/*"')
+            raise (PARAMS / name).bad(f"{quoted(need)} is not a {name}", f'name one, or a pattern, as in "{name}/*"')
+        if self.framegrabber in (self.radio, self.video):
+            other = "radio" if self.framegrabber == self.radio else "video channel"
+            what = f"{quoted(self.framegrabber)} is needed already, as the {other}"
+            raise (PARAMS / "framegrabber").bad(what, "name another device")
         return RobotNeeds(robot, self.radio, self.video, self.framegrabber, self.command_rate)
 
 

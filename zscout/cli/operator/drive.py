@@ -51,8 +51,9 @@ HELP: Final = "arrows or wasd drive · space stops · + - speed · g releases ·
 
 
 def _rc_option(kind: str) -> Callable[[common.F], common.F]:
-    """`--radio RC` and the like. Default: any RC of this kind."""
-    rc = common.Parsed("rc", lambda text, _: parse_rc(text, kind, pattern=True))
+    """`--radio RC` and the like. Default: any RC of this kind. Cameras may have names of any kind."""
+    other = kind == "framegrabber"
+    rc = common.Parsed("rc", lambda text, _: parse_rc(text, kind, pattern=True, other_kinds=other))
     return click.option(f"--{kind}", default=f"{kind}/*", type=rc, shell_complete=completion.rcs)
 
 
@@ -103,6 +104,9 @@ async def drive(
       zscout drive scout33 --stand-by --rate 10
       zscout drive robot/scout33 --pad /dev/input/js0 --record runs/scout33.rrd
     """
+    if framegrabber in (radio, video):
+        what = f"{quoted(framegrabber)} is needed already, for another purpose"
+        raise BadInput(f"--framegrabber: {what}; name another device")
     if not sys.stdin.isatty():
         raise BadInput("standard input is not a terminal, and zscout drive reads keys; run it at a terminal")
     common.check_recording("--record", record)

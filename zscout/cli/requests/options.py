@@ -86,10 +86,11 @@ def parse_comment(text: str, option: str) -> str:
         raise BadInput(f"{option}: {error}") from None
 
 
-def parse_rc(text: str, kind: str, *, pattern: bool = False) -> str:
-    """Parse an RC of `kind`: `robot/scout33`, `scout33`, with `pattern` also `robot/*`. Raises BadInput, BadName."""
+def parse_rc(text: str, kind: str, *, pattern: bool = False, other_kinds: bool = False) -> str:
+    """Parse an RC of `kind`: `robot/scout33`, `scout33`, with `pattern` also `robot/*`, with `other_kinds` also
+    `camera/door`. Raises BadInput, BadName."""
     rc = text if "/" in text else f"{kind}/{text}"
-    if rc.partition("/")[0] != kind or (is_pattern(rc) and not pattern):
+    if (rc.partition("/")[0] != kind and not other_kinds) or (is_pattern(rc) and not pattern):
         raise BadInput(f"{quoted(text)} is not a {kind}; name one, as in {kind}/NAME")
     check_need(rc)
     return rc
