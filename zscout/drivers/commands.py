@@ -1,4 +1,5 @@
-"""Commands of radios and robots, read from a command's `do` and checked."""
+"""Commands of radios and robots, read from a command's `do` and checked. `resource_controller.py` has checked the grant
+and the time to live before."""
 
 from __future__ import annotations
 

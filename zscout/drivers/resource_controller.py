@@ -1,9 +1,11 @@
 """A resource controller (RC) on the mesh: the part that every driver shares.
 
-A driver (`driver.py`) controls its device; `ResourceController` owns the keys, checks every command against the hold in
-force when it is carried out, votes, and puts the device into its safe state when its holder is gone.
+A driver (`driver.py`) controls its device; `ResourceController` owns the keys, checks every command against its time to
+live and the hold in force when it is carried out, votes, and puts the device into its safe state when its holder is
+gone.
 
-A node that loses the mesh receives no publication of a leader: after the hold lease `HoldTable.expire` (`holds.py`)
+When the holder's client dies, the leader notices (`rcm/roster.py`), and its next publication no longer has the hold. A
+node that loses the mesh receives no publication of a leader: after the hold lease `HoldTable.expire` (`holds.py`)
 ends the holds, and `_make_safe` follows."""
 
 from __future__ import annotations
@@ -550,6 +552,7 @@ class ResourceController:
         return self.mesh.now() - query.arrived + self.stall.waited_through(query.arrived)
 
     def _is_stale(self, query: CommandQuery) -> bool:
+        """Return True if the command's time to live is over: it is refused then, not carried out."""
         return self._waited(query) > query.message.ttl * SECOND
 
     async def _answer(self, query: CommandQuery, work: Awaitable[Any]) -> None:

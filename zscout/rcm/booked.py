@@ -1,5 +1,5 @@
 """The leader's interface to the fleet's bookings. Rules and time zones of dates are read outside this pure room
-(`zscout/services/rcm/bookings.py`)."""
+(`zscout/services/rcm/bookings.py`). The core's part, with the take-up by a request, is `scheduling/calendar.py`."""
 
 from __future__ import annotations
 

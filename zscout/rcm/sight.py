@@ -1,4 +1,7 @@
-"""Counts the tokens of other hosts, and judges if this leader itself was away when they disappeared (rule 9). Pure."""
+"""Counts the tokens of other hosts, and judges if this leader itself was away when they disappeared (rule 9). Pure.
+
+A leader that was away gives the clients a lease (`roster.py`); it does not stop leading. It steps down when it sees a
+higher term (`services/rcm/candidate.py`); until then RCs that miss its publications end their holds themselves."""
 
 from __future__ import annotations
 

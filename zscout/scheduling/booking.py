@@ -1,4 +1,4 @@
-"""Bookings: several RCs at once, from a date on. `calendar.py` keeps them."""
+"""Bookings: several RCs at once, from a date on. `calendar.py` keeps them, and gives them to requests (`take_up`)."""
 
 from __future__ import annotations
 

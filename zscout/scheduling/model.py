@@ -1,5 +1,7 @@
 """Data of the scheduling core: requests, RCs, events, effects and status.
 
+`Arc.rank` is the order of the queue, `Arc.preemptible_by` the rule of preemption.
+
 Times are whole ns on the caller's clock. Bandwidth parameters are `Fraction`, so sums are exact."""
 
 from __future__ import annotations
@@ -213,6 +215,7 @@ class Arc:
         self.put_at(self.position)
 
     def put_at(self, position: int) -> None:
+        """Set its rank: priority first, then its group's position, the shorter runtime, the earlier place."""
         self.position = position
         self.rank = (-self.priority, position, self.request.min_runtime, self.place, self.id)
 

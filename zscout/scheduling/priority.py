@@ -4,7 +4,7 @@ A pass:
 
 1. Collect the changes since the last pass: RCs freed, joined or lost, new and invalidated votes.
 2. Collect the ARCs to check: the ready ones, and the first watcher of each freed RC.
-3. Check them in rank order (`AdmissionCheck`). For each, `a`:
+3. Check them in rank order (`Arc.rank`), each by an `AdmissionCheck`. For each, `a`:
    a. `a` waits if an RC of `a` is absent, is unwell and `a` is no operator's, or has a holder not preempted for `a`.
    b. Every sharable RC that `a` needs must accept `a` beside its holders without the exclusive victims (of exclusive
     RCs of `a`) and the preemptible sharers (of sharable RCs of `a`). Otherwise `a` waits, and nothing is preempted.

@@ -35,7 +35,7 @@ class QueueIndex:
         self.unreported = 0  # bits of the RCs with new holders not yet reported to watchers
         self.unreported_classes: dict[PatternClass, None] = {}
         self.contended = 0  # bits of the RCs whose holders may have another upcoming end (`upcoming.py`)
-        self.ranks: list[Rank] = []  # of all queued ARCs, best first
+        self.ranks: list[Rank] = []  # of all queued ARCs, best first (`Arc.put_at` computes them)
         self._not_starving: list[tuple[Ns, ArcId]] = []  # queued ARCs, by when they begin to starve
         self.starving: list[tuple[int, Ns, ArcId]] = []  # by band of priorities (negated), then by when they began
         self.starving_version = 0  # grows when an ARC starts or stops starving

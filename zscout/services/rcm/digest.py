@@ -1,5 +1,5 @@
-"""Translates the core's events and effects in one term to beginnings and ends of holds, for figures and notices to
-people. It runs once all answers of an instant are sent."""
+"""Digest of an instant (not of files): translates the core's events and effects in one term to beginnings and ends of
+holds, for figures and notices to people. It runs once all answers of an instant are sent."""
 
 from __future__ import annotations
 
