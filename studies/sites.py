@@ -292,8 +292,8 @@ def present(state: RcmState) -> set[str]:
 
 
 async def times(sites: Sites, rounds: int) -> dict[str, list[Ns]]:
-    """Times from a request to the confirmed grant, alternately of a program in the site of leader and RC, and of a
-    program in the other site."""
+    """Measure the times from a request to the confirmed grant. Two programs take turns: one in the site of the leader
+    and the RC, one in the other site."""
     programs = {site: await sites.program(site, f"timer-{site}") for site in SITES}
     leads = (await sites.whole(*programs.values())).host[0]
     found: dict[str, list[Ns]] = {INSIDE: [], ACROSS: []}

@@ -600,7 +600,7 @@ class Client(Peer):
             self.news.notify_all()
 
     def ask_anew(self, request: Request) -> None:
-        """Ask under a new id: the hold had its time, and this client never knew of it."""
+        """Request again, under a new id: the hold ended before this client learned of its grant."""
         old, new = request.asked["id"], secrets.token_hex(8)
         say("anew", id=old, new=new)
         request.asked["id"], request.last = new, (NO_TERM, 0)

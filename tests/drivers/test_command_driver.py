@@ -317,7 +317,7 @@ async def test_a_node_that_ends_stops_and_makes_safe() -> None:
 
 async def test_one_that_stands_by_leaves_the_device_alone_until_it_is_used() -> None:
     async with play(state=InstanceState.STANDS_BY, safe=TELL, health=TELL) as (driver, rc):
-        await rc.until("it was not made safe: it stands by")
+        await rc.until("it was not made safe: it is on standby")
         await driver.safe()  # as its node ends
         assert told() == []
         rc.instances.state = InstanceState.OFFERED
@@ -330,7 +330,7 @@ async def test_the_device_is_left_alone_until_it_is_known_who_serves() -> None:
         assert rc.said == ["it was not made safe yet"]
         rc.instances.state = InstanceState.STANDS_BY
         rc.informed.set()
-        await rc.until("it was not made safe: it stands by")
+        await rc.until("it was not made safe: it is on standby")
         assert told() == []
         rc.instances.state = InstanceState.OFFERED
         await rc.until("ok")

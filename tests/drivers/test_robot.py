@@ -75,7 +75,7 @@ async def test_a_second_node_that_offers_a_held_robot_leaves_it_alone(tmp_path: 
         await line.until(is_in(DrivePacket))
         halts = [packet for packet in line.packets if isinstance(packet, HaltPacket)]
         cart(lab, "other")
-        await lab.logged("other", "robot/r1 stands by: duplicate of robot/r1 at cart")
+        await lab.logged("other", "robot/r1 is on standby: duplicate of robot/r1 at cart")
         await lab.logged("other", "other is on the mesh")
         for _ in range(20):
             assert await answer(obeyed(client, "robot/r1", grant, TURN)) == "done"

@@ -44,7 +44,7 @@ async def test_the_one_that_is_not_named_obeys_nothing_and_says_so(tmp_path: Pat
         lab.node("ws2", RC, extra="candidate = false")
         client = await lab.begun()
         lab.node("ws1", RC, extra="candidate = false")
-        await lab.logged("ws1", "robot/arm stands by: duplicate of robot/arm at ws2")
+        await lab.logged("ws1", "robot/arm is on standby: duplicate of robot/arm at ws2")
         arc = await client.request("work", {RC: {}}, min_runtime=600)
         grant = await granted(client, arc, confirmed=True)
         assert [await answers(client, grant) for _ in range(20)] == [[1]] * 20
@@ -112,7 +112,7 @@ def obeyed(folder: Path) -> list[Obeyed]:
 
 def stood_by(folder: Path) -> int:
     """How often either has said that it stands by."""
-    return sum((folder / f"{host}.log").read_text().count("stands by: duplicate of") for host in ("ws1", "ws2"))
+    return sum((folder / f"{host}.log").read_text().count("is on standby: duplicate of") for host in ("ws1", "ws2"))
 
 
 def test_of_two_nodes_with_one_rc_never_two_obey_one_reign(tmp_path: Path) -> None:

@@ -197,7 +197,7 @@ class CommandDriver(Driver):
     async def _check(self) -> None:
         """Make the device safe if its state is unknown, then check its health."""
         if self._stands_by:
-            self._unsure = "it was not made safe: it stands by"
+            self._unsure = "it was not made safe: it is on standby"
         elif self._unsure and self._holder is None:
             self._unsure = (await self._run("safe", self._table.safe)).problem
         if not self._unsure:

@@ -82,7 +82,7 @@ class Instances:
         """Note the host of the serving instance."""
         before, self._host = self._host, host
         if self.state is InstanceState.STANDS_BY and before != host:
-            log.warning("%s stands by: duplicate of %s", self._rc, self.duplicate_of)
+            log.warning("%s is on standby: duplicate of %s", self._rc, self.duplicate_of)
             self._on_change()
 
     def _on_token(self, token: Token, alive: bool) -> None:
@@ -115,7 +115,7 @@ class Instances:
             return
         self.state = state
         if state is InstanceState.STANDS_BY:
-            log.warning("%s stands by: duplicate of %s", self._rc, self.duplicate_of)
+            log.warning("%s is on standby: duplicate of %s", self._rc, self.duplicate_of)
         else:
             log.info("%s %s", self._rc, state.value)
         self._on_change()

@@ -98,7 +98,7 @@ def _make(rc: PluginRc, driver: type[Driver]) -> Driver:
     try:
         return driver.configured(options)
     except ValueError as error:
-        raise rc.at.bad(str(error) or "the driver does not accept a value", "correct it") from error
+        raise rc.at.bad(str(error) or "its driver refuses a value without a reason", "correct it") from error
     except Exception as error:
         raise _unfit(rc.at / "driver", f"{driver.__module__}.{driver.__qualname__} can't be created", error) from error
 

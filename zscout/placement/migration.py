@@ -265,7 +265,7 @@ class Migrations:
         cordoned = state.balancer.cordoned
         if host not in cordoned:
             if host not in state.alive and host not in state.balancer.reports:
-                state.refuse(host, "unknown_host", f"there is no host {host}")
+                state.refuse(host, "unknown_host", f"unknown host {host}; zscout status lists all")
                 return
             if len(cordoned) >= MAX_HOSTS:
                 state.refuse(

@@ -273,7 +273,7 @@ class PlacementState:
     def known(self, component: ComponentId) -> ComponentRecord | None:
         """Like `get`, but refuse the request if it does not exist."""
         if component not in self.components:
-            self.refuse(component, "unknown_component", f"there is no component {component}")
+            self.refuse(component, "unknown_component", f"unknown component {component}; see zscout component list")
         return self.get(component)
 
     def add(self, record: ComponentRecord) -> bool:

@@ -249,7 +249,7 @@ class Operations:
             raise Refused("old_term", "a leader of a later term gave this place; try again", place.term)
         if ask.term is not None and ask.term > self.core.term:
             self._out.higher.append((self._roster.client_word(client, ask.term), None))
-            raise Refused("old_term", f"{sender} has promised a higher term", ask.term)
+            raise Refused("old_term", f"{sender} has promised a higher term; ask the leader of that term", ask.term)
 
     def _ask_again(self, ticket: Ticket, ask: Ask, sender: Sender, client: ClientId, arc: ArcId) -> None:
         """Answer for an open ARC with its state, after the instant if its client reports something new."""

@@ -148,7 +148,7 @@ class RequestLog:
         return status is not None and status.vouched
 
     def _is_of_another(self, now: Ns, ended: HoldEnded) -> bool:
-        """Return True if an RC had reported this hold, and the ARC's client believes in one that RCs may yet report."""
+        """Return True if the ARC's client believes in another hold than the ended one, and RCs may yet report it."""
         known = self._requests.get(ended.arc)
         believed = None if known is None else known.believed_grant
         return believed not in (None, ended.grant) and self.may_be_held(now, ended.arc)

@@ -366,7 +366,7 @@ class Calendar:
         self._checks_left = MAX_CHECKS
 
     def follow_up(self) -> None:
-        """Judge dates, ask votes and report dangers where something has changed."""
+        """Judge dates, ask for votes, and report dangers where something has changed."""
         state = self._state
         if not state.claims and not self._in_conflict:
             if self._reserved is not None or state.dates.touched:

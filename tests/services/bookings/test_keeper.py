@@ -72,7 +72,7 @@ async def test_a_file_is_read_as_it_was_written(tmp_path: Path) -> None:
 def test_a_file_of_another_fleet_is_not_used(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     asyncio.run(BookingFile(tmp_path, "other").write([record("one")]))
     assert BookingFile(tmp_path, "zscout").read() == []
-    assert "is of fleet other, and is not used" in caplog.text
+    assert "belongs to fleet other, and is not used" in caplog.text
     assert (tmp_path / ASIDE).exists()
 
 

@@ -108,7 +108,7 @@ class FakeNode:
                 query.answer(self.views[component, incarnation])
             case StopComponent(component, incarnation) if incarnation is not None:
                 if (component, incarnation) not in self.views:
-                    raise Refused("unknown_component", "there is no component of this name")
+                    raise Refused("unknown_component", "unknown component; see zscout component list")
                 self.end(component, incarnation, "stopped")
                 query.answer(self.views[component, incarnation])
             case MoveComponent(component, incarnation, to, to_incarnation):

@@ -112,7 +112,7 @@ class MovableClient:
                 while arc.id in self.store.expected:
                     await self.store.changed(arc)
         except TimeoutError:
-            log.warning("%s was handed over to here, but not granted for %g s; requesting it", arc.name, EXPECT_TIMEOUT)
+            log.warning("%s was handed over to this client, but not granted within %g s", arc.name, EXPECT_TIMEOUT)
             self.store.adopt(arc)
 
     def _ask_soon(self, arc: OpenArc) -> None:

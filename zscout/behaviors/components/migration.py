@@ -111,7 +111,9 @@ class OutgoingMove:
     async def _send_state(self, state: bytes, requests: list[OpenRequest]) -> None:
         order = messages.RestoreComponent(self._name, self.incarnation, state, requests)
         if len(messages.encode(order)) > MAX_MOVE:
-            raise NotMoved("too_large", f"state and {len(requests)} requests exceed {MAX_MOVE} bytes")
+            raise NotMoved(
+                "too_large", f"its state and {len(requests)} requests are larger than {MAX_MOVE} bytes; save less state"
+            )
         deadline = self._client.mesh.now() + round(RESTORE_TIMEOUT * SECOND)
         pause, longest = PAUSES
         left = RESTORE_TIMEOUT

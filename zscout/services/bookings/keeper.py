@@ -63,7 +63,7 @@ class BookingFile:
             log.warning("%s can't be read, and is not used%s: %s", self._path, self._set_aside(), error)
             return []
         if kept.fleet != self._fleet:
-            log.warning("%s is of fleet %s, and is not used%s", self._path, kept.fleet, self._set_aside())
+            log.warning("%s belongs to fleet %s, and is not used%s", self._path, kept.fleet, self._set_aside())
             return []
         found: list[messages.BookingRecord] = []
         for raw in kept.records:
@@ -72,7 +72,7 @@ class BookingFile:
             except messages.Malformed as error:
                 log.warning("a booking in %s can't be read, and is left out: %s", self._path, error)
         if len(found) < len(kept.records):
-            log.warning("%s is used only in part%s", self._path, self._set_aside())
+            log.warning("%s is damaged in part; its other bookings are used%s", self._path, self._set_aside())
         return found
 
     def _set_aside(self) -> str:

@@ -193,7 +193,7 @@ class ComponentProcess:
         except OSError as error:
             self._verdict = self._verdict or EndReport("failed", f"it can't be started: {error}")
         except Exception as error:
-            log.exception("%s failed at its node", self._tag)
+            log.exception("the node failed to run %s", self._tag)
             self._verdict = self._verdict or EndReport("failed", f"its node failed: {error}")
         finally:
             late.cancel()

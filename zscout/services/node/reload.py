@@ -35,7 +35,7 @@ class FilesInForce:
 
 
 class Reload:
-    """The settings in force, and the functions that apply new ones. `read` raises BadInput, and so does `Reload`."""
+    """The settings in force, and the functions that apply new ones. Calls `read` at once, which raises BadInput."""
 
     def __init__(self, read: Callable[[], Node]) -> None:
         self._read = read

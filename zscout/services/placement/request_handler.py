@@ -123,7 +123,7 @@ class PlacerRequestHandler:
                 continue
             self._pop(query)
             if status is None:
-                query.refuse(Refused("unknown_component", "there is no component of this name").problem)
+                query.refuse(Refused("unknown_component", "unknown component; see zscout component list").problem)
             elif isinstance(operation, messages.MigrateComponent) and waiting.host == status.host != operation.to:
                 reason = status.reason or f"it still runs on {status.host}"
                 query.refuse(Refused("move_failed", reason).problem)

@@ -246,7 +246,7 @@ class BookingHandler:
                 # Not cancelled, which is final: another leader may have made it as well, or may have received it.
                 self._records.remove(keep.booking)
                 self._dates.out.events.append(self._dates.reconcile())
-            refused = Refused("not_kept", f"no other host stored this booking: {why or 'it is over'}")
+            refused = Refused("not_kept", f"the booking was not stored: {why or 'it is over'}")
             self._refuse(keep.ticket, refused)
         else:
             self._dates.out.answers.append((keep.ticket, self._dates.view(record)))

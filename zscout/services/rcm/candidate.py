@@ -169,7 +169,7 @@ class Candidate:
         if self._again is not None:
             return
         delay = self._setbacks.delay(self.mesh.now())
-        log.error("this candidate withdraws, and becomes one again in %g s", delay)
+        log.error("this candidate withdraws, and returns in %g s", delay)
         self._again = asyncio.get_running_loop().call_later(delay, self.start)
         self._withdraw()
 

@@ -50,7 +50,7 @@ class TermFile:
             log.warning("%s can't be read, and is not used: %s", self._path, error)
             return NO_TERM
         if kept.fleet != self._fleet or not 0 <= kept.term.counter <= MAX_COUNTER:
-            log.warning("%s is not of fleet %s, and is not used", self._path, self._fleet)
+            log.warning("%s does not belong to fleet %s, and is not used", self._path, self._fleet)
             return NO_TERM
         return kept.term
 

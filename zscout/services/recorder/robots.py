@@ -316,7 +316,7 @@ class RobotTracker:
         instance = state.rc, state.host
         if state.duplicate_of != self._duplicates.get(instance, "") and len(self._duplicates) < MAX_FOLLOWED:
             self._duplicates[instance] = state.duplicate_of
-            role = f"stands by: duplicate of {state.duplicate_of}" if state.duplicate_of else "serves"
+            role = f"on standby: duplicate of {state.duplicate_of}" if state.duplicate_of else "serves"
             (self._drawing.warn if state.duplicate_of else self._drawing.event)(
                 at, f"{state.rc} at {state.host} {role}"
             )

@@ -66,8 +66,8 @@ class World:
             self._move(dt / parts)
 
     def picture(self, robot: str) -> Picture:
-        """The robot's camera picture before transmission, uint8 (120, 160). It changes the camera's exposure, so
-        the same world needs the same calls."""
+        """The robot's camera picture before transmission, uint8 (120, 160). Each call changes the camera's
+        exposure: to repeat a run exactly, make the same calls."""
         sensor, noise = self._sensors[robot], self.plan.noise
         lamps = 1 + noise.flicker * sensor.flicker()
         linear = self._camera.linear(*self.bodies[robot].pose, self._moving(robot), lamps, self._daylight())
