@@ -488,7 +488,7 @@ class _FleetTime(NamedTuple):
         return self.differs(before) <= AGREE
 
     def continues(self, before: _FleetTime) -> bool:
-        """Return True if it has the same beginning as `before`, and does not differ enough to be another."""
+        """Return True if this may be the same fleet time as `before`: it has the same beginning and differs little."""
         return abs(self.since - before.since) <= SAME and self.differs(before) <= DIFFERS
 
     def differs(self, before: _FleetTime) -> float:
