@@ -33,10 +33,10 @@ SECURED: Final = frozenset(
     )
 )
 """Modules about rights: they say themselves who has which, and where they need a plain fleet."""
-_NO_FLEET: Final = "no node is started, or one without others"
-_OWN: Final = "the program makes a fleet of its own, without a fleet file"
-_FORGES: Final = "sends in others' names, which certificates forbid: test_closed_doors, test_liars, test_floods"
-_RIGHTLESS: Final = "what it tries meets no right: pictures, drivers, load, signals in the program itself"
+_NO_FLEET: Final = "starts no node, or one alone"
+_OWN: Final = "starts a fleet of its own, without a fleet file"
+_FORGES: Final = "sends under other names, which certificates forbid: see test_closed_doors, test_liars, test_floods"
+_RIGHTLESS: Final = "rights play no part: pictures, drivers, load, signals in the program itself"
 PLAIN_ONLY: Final[dict[str, str]] = {
     "behaviors/test_guardian.py": _NO_FLEET,
     "cli/fleet/test_calls_home.py": _NO_FLEET,
@@ -83,15 +83,15 @@ PLAIN_ONLY: Final[dict[str, str]] = {
     "live/robots/test_warming_up.py": _RIGHTLESS,
     "live/test_blocking.py": _RIGHTLESS,
     "services/node/test_tree_load.py": _RIGHTLESS,
-    "live/test_moving.py": "two minutes of deaths around a move; test_component_moves has moves with rights",
+    "live/test_moving.py": "kills processes around a move for two minutes; test_component_moves has moves with rights",
     "fuzz/test_live.py": _FORGES,
     "services/recorder/test_robots_heard.py": _FORGES,
     "live/test_bad_input.py": _FORGES,
     "live/test_forgeries.py": _FORGES,
     "live/test_plain_doors.py": _FORGES,
-    "deploy/test_units.py": "systemd's units run as they are shipped; test_install_host makes those of a secured host",
-    "docs/test_coming_from_labgrid.py": "a user releases another's board, as only operators may with rights",
-    "live/test_versions.py": "version 0.1.0 knows no [security]",
+    "deploy/test_units.py": "runs systemd's units as shipped; test_install_host covers a secured host",
+    "docs/test_coming_from_labgrid.py": "a user releases another user's board; with rights only operators may",
+    "live/test_versions.py": "version 0.1.0 has no [security]",
 }
 """Modules, and why they have no secured fleet."""
 
