@@ -6,7 +6,7 @@ import ast
 import io
 import re
 import tokenize
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -17,12 +17,13 @@ from tests.fleets import PLAIN_ONLY, QUICK, SECURED, TESTS
 
 ROOT = Path(__file__).parents[1]
 MODULES = {path.relative_to(ROOT): ast.parse(path.read_text()) for path in sorted((ROOT / "zscout").rglob("*.py"))}
-PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
+TOP_PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md"]
+PAGES = [*TOP_PAGES, *sorted((ROOT / "docs").rglob("*.md"))]
 SOURCES = {path.name for tree in ("zscout", "tests", "studies", "benchmarks") for path in (ROOT / tree).rglob("*.py")}
 WROTE = re.compile(r"`([\w./]+)`")
 TREES = {"zscout", "tests", "studies", "benchmarks", "examples"} | {path.parts[1] for path in MODULES}
 LIVE = re.compile(r"pytest\.mark\.live\b")
-LINK = re.compile(r"\]\(([^)#:]+)(?:#[^)]*)?\)")
+LINK = re.compile(r"\]\(([^)#:]+)(?:#([^)]*))?\)")
 HEADLESS = (
     r"(?:^|[.:;,(]\s+|\b(?:of|by|from|to|for|with|than|and|as|how|is) )(?:[Ww]ho|[Ww]hat)(?:ever)? (?:is|was|has|had|"
     r"can|can't|may|asks?|holds?|waits?|comes?|goes|ends?|runs?|came|went|needs?|reads?|makes?|would|does|did|will|takes?|"
@@ -119,9 +120,17 @@ def test_a_function_that_the_page_of_questions_names_is_in_its_file() -> None:
     assert named - found == set()
 
 
-@pytest.mark.parametrize("page", PAGES[:2], ids=lambda page: page.name)
-def test_a_file_that_a_page_links_exists(page: Path) -> None:
-    assert {link for link in LINK.findall(page.read_text()) if not (page.parent / link).exists()} == set()
+def slugs(page: Path) -> set[str]:
+    """The anchors of a page's headings."""
+    headings = re.findall(r"^#+ (.+)$", page.read_text(), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading).lower().replace(" ", "-") for heading in headings}
+
+
+@pytest.mark.parametrize("page", TOP_PAGES, ids=lambda page: page.name)
+def test_a_file_and_heading_that_a_page_links_exists(page: Path) -> None:
+    links = [(page.parent / file, heading) for file, heading in LINK.findall(page.read_text())]
+    assert [str(file) for file, _ in links if not file.exists()] == []
+    assert [f"{file}#{heading}" for file, heading in links if heading and heading not in slugs(file)] == []
 
 
 def test_the_page_on_the_architecture_names_every_room() -> None:
@@ -139,7 +148,8 @@ def test_every_live_module_is_on_both_fleets_secured_or_says_why_not() -> None:
     assert not SECURED & PLAIN_ONLY.keys()
     assert {*SECURED, *PLAIN_ONLY, *QUICK} - live == set()
     page = (ROOT / "docs" / "suite.md").read_text()
-    assert {reason for reason in PLAIN_ONLY.values() if reason not in page} == set()
+    rows = {f"| {reason} | {count} |" for reason, count in Counter(PLAIN_ONLY.values()).items()}
+    assert {row for row in rows if row not in page} == set()
     secured, plain = len(SECURED), len(PLAIN_ONLY)
     counts = f"{len(live) - secured - plain} run on both, {secured} are about rights, {plain} on a plain fleet alone"
     assert counts in page
