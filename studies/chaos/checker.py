@@ -103,8 +103,8 @@ class Checker:
         )
 
     def unlinked(self, hosts: Iterable[str], at: int) -> bool:
-        """Return True if one of these hosts had no link to a leader's host for longer than the lease, until CALM ago or
-        later."""
+        """Return True if one of these hosts had no link to a leader's host for longer than the lease, and if that ended
+        no longer than CALM before `at`."""
         return any(
             gap.until - gap.since > LEASE * SECOND
             and gap.since <= at <= gap.until + CALM

@@ -306,8 +306,8 @@ class Fleet:
 
 
 def random_faults(fleet: Fleet, rng: random.Random, kinds: list[str], until: Callable[[int], bool]) -> list[Fault]:
-    """Faults `until` their number is enough. Some come in pairs, and some without waiting until all clients are
-    served."""
+    """Cause faults until `until` returns True for their number. Some come in pairs, and some before all clients are
+    served again."""
     faults: list[Fault] = []
     single = len(kinds) == 1
     while not until(len(faults)):

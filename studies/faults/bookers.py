@@ -97,7 +97,7 @@ class Hosts:
         return EPOCH + self._passed + (self._now() - START) * (1 + self._drift[host]) + self.ahead[host]
 
     def pass_by(self, seconds: float) -> None:
-        """Let time pass on all clocks in which nothing ran."""
+        """Advance all clocks by a time in which no process ran."""
         self._passed += seconds
 
     def copy_disks(self) -> None:

@@ -138,9 +138,9 @@ class Size:
 
     @classmethod
     def of(cls, seed: int) -> Size:
-        """Every tenth run each is long with many clients, or has failing moves, or programs that use devices past their
-        RCs, or commands, or a thief, or liars. Every fifth run has bookings, every twentieth a forger, every fortieth
-        slow devices, every eightieth unwell devices."""
+        """The kind of a run. Of ten runs one is long with many clients; one each has failing moves, programs that use
+        devices past their RCs, commands, a thief, and liars; two have bookings. Every twentieth run has a forger, every
+        fortieth slow devices, every eightieth unwell devices."""
         match seed % 10:
             case 3 | 4:
                 return cls(bookers=2, clients=3, faults=4, span=40.0)

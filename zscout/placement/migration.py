@@ -334,5 +334,5 @@ class Migrations:
 
 
 def _reservation(record: ComponentRecord) -> ComponentId:
-    """Reserves room on the target; not a component's name, which has no blanks."""
+    """The name under which a move reserves room on its target. With its blanks it can't be a component's own name."""
     return f"{record.component} on its way"

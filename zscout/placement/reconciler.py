@@ -96,7 +96,7 @@ class Reconciler:
         return record.state in OVER or (record.state == "stopping" and record.host is None)
 
     def _can_be_at(self, record: ComponentRecord, host: HostName) -> bool:
-        """Return True if the incarnation can be at that host; without a host, it now is there."""
+        """Return True if the incarnation can be at that host. If its host was unknown, record this one."""
         if record.host is None and host in self.state.alive:
             record.host = host
             record.host_reason = f"found running on {host}"
@@ -275,7 +275,7 @@ class Reconciler:
                 self.migrations.source_ended(record, move, host_gone(host))
 
     def inherited(self, status: Placement) -> None:
-        """Valid until a host contradicts it, or none confirms it within GRACE."""
+        """Take over a published placement, until a host contradicts it, or none confirms it within GRACE."""
         state = self.state
         if not state.note_incarnation(status.component, status.incarnation):
             return

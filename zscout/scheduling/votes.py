@@ -1,4 +1,4 @@
-"""Votes of sharable RCs: the answers in force, and the open proposals (the query ends after the LATE_VOTE of
+"""Votes of sharable RCs: the answers in force, and the open proposals (their queries end after LATE_VOTE_S of
 `services/rcm/rcm.py`).
 
 An RC that accepts a set of holders accepts every subset, so a veto also counts for every superset, and an answer

@@ -136,8 +136,8 @@ class _Meanwhile:
         self.level += off / self.pictures
 
     def another(self) -> NDArray[np.bool_]:
-        """Return the changed regions that are still, as a mask: probably another scene. Changed regions that are not
-        still move, or were spoiled in transmission."""
+        """Return the changed regions that are still, as a mask: they are the new background. The others move, or were
+        spoiled in transmission."""
         count, labels = cv2.connectedComponents(_with_rim(self._mask))
         area = np.bincount(labels.ravel(), minlength=count)
         differ = np.bincount(labels.ravel(), weights=self._differ.ravel(), minlength=count)

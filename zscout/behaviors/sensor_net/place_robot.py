@@ -95,7 +95,7 @@ class PlaceRobot(Behavior):
                     self.video = None
 
     async def _offer_safe_points(self, context: BehaviorContext) -> None:
-        """Without a hold nothing changes here for long: a time to be moved."""
+        """Offer safe points for moves while it waits for a hold: nothing changes then."""
         while True:
             if not self.holding:
                 await context.safe_point()

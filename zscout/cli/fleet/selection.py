@@ -65,7 +65,7 @@ class Selection:
         return common.unknown("device, request or host", name, self._all, "and there are none", "known")
 
     def _means(self, *known: str) -> bool:
-        """Return True if the user means something of these names. A hint shows the first of them."""
+        """Return True if one of the user's names means the thing `known` by these names. Hints show the first."""
         self._all.setdefault(known[0], [])
         met = {name for name in self.names if any(name == other or fnmatchcase(other, _glob(name)) for other in known)}
         self._met |= met
