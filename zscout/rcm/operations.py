@@ -155,7 +155,7 @@ class Operations:
         ticket, operation, sender, to = self._hand_overs.pop(number)
         try:
             if not there:
-                raise Refused("unknown_client", f"{to} is not on the mesh")
+                raise Refused("unknown_client", f"{to} is not on the mesh; start it first")
             self._hand_over(ticket, operation, sender, to)
         except Refused as refused:
             self._out.at_once.append((ticket, refused.problem))

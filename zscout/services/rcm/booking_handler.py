@@ -125,7 +125,7 @@ class BookingHandler:
             zone_of(wanted.zone)
             runtime, patience = duration(wanted.runtime, "runtime"), duration(wanted.patience, "patience")
             if (wanted.urgent or wanted.lasting) and not wanted.maintenance:
-                raise ValueError("only maintenance can be urgent or lasting")
+                raise ValueError("only maintenance can be urgent or lasting; leave both out")
             if wanted.broken and (wanted.urgent or not wanted.lasting or any(map(host_in, wanted.needs))):
                 raise ValueError("broken devices are in lasting maintenance, which is not urgent and names no host")
             if wanted.lasting and (wanted.every or wanted.runtime != WINDOW):
