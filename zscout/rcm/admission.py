@@ -48,9 +48,7 @@ class Present(Protocol):
 
 
 class Holding(Present, Protocol):
-    def held_by(self, names: Collection[str], *but: ArcId) -> int:
-        """The number of RCs held by these owners."""
-        ...
+    def held_by(self, names: Collection[str], *but: ArcId) -> int: ...
 
 
 @dataclass(slots=True)
@@ -74,8 +72,6 @@ class Admitted:
 
 
 class Admission:
-    """The limits of a fleet, the rights of its names, and the places of one term."""
-
     def __init__(self, authority: Authority, places: Places) -> None:
         self.authority, self.places = authority, places
 
@@ -85,17 +81,15 @@ class Admission:
 
     @property
     def closed(self) -> bool:
-        """Return True if certificates prove names."""
         return self.authority.enforced
 
     def admit(self, asked: Wanted, sender: Sender, present: Present) -> ArcRequest:
-        """The request, without place and booking. Raises Refused with the fault and the remedy."""
+        """Return the request, without place and booking. Raises Refused with the fault and the remedy."""
         request = self.form(asked, sender)
         self.check(request, present)
         return request
 
     def check(self, request: ArcRequest, present: Present) -> None:
-        """Raises Refused for a request that its client may not make now."""
         client, owner, limits = request.client, request.owner, self.limits
         self.authority.check_ask(client.partition("/")[0], request, lambda names: present.of_owners(names, request.arc))
         if present.waiting_now >= limits.max_queued:
@@ -162,8 +156,6 @@ class Admission:
             for parameter in params:
                 check_name(parameter, f"parameter of {name}")
 
-    # Places
-
     def check_place(self, place: Place, could_have_issued: Callable[[Place], bool]) -> None:
         """Raises Refused for a place that no RCM can have issued."""
         if absurd(place.term, self.places.term):
@@ -181,8 +173,6 @@ class Admission:
         self.check_place(asked.place, lambda place: place.term != self.places.term)
         known = self.places.may_recover(asked.place, client, asked.was or asked.id, asked.seal)
         return asked.place if known else None
-
-    # Handing over
 
     def check_hand_over(
         self, sender: Sender, to: Sender, arcs: Sequence[ArcStatus], replaced: Sequence[ArcId], present: Holding
@@ -204,11 +194,8 @@ class Admission:
             lambda names: present.held_by(names, *replaced),
         )
 
-    # Bookings
-
     def check_booking(self, wanted: Book | FindSlots, sender: Sender, *, held: bool = False) -> None:
-        """Raises Refused for an invalid booking, or one that `sender` may not make. `held`: it reports devices broken
-        that it holds."""
+        """Raises Refused if `sender` may not make this booking. `held`: it reports devices broken that it holds."""
         if isinstance(wanted, Book) and wanted.maintenance:
             if not held:
                 what = "report devices broken that it does not hold" if wanted.broken else "put devices in maintenance"
@@ -228,7 +215,7 @@ class Admission:
             self.authority.check_operator(sender, f"{what}: {record.name} is {record.owner}'s")
 
     def check_take_up(self, asked: Ask | OpenRequest, sender: Sender, record: BookingRecord) -> None:
-        """Raises Refused if this request may not use that booking."""
+        """Raises Refused."""
         self.check_owner(sender, record, "take it up")
         if record.maintenance:
             raise Refused("bad_request", f"{record.name} is maintenance, which no request can use")
@@ -242,8 +229,6 @@ class Admission:
                 return ""
             self.check_take_up(asked, sender, record)
         return asked.booking
-
-    # Recovered holds
 
     def clamped(self, request: ArcRequest) -> ArcRequest:
         """The request of a hold, cut down to what its client may ask for now."""

@@ -43,13 +43,12 @@ class Authority:
         """The components that the placer published last."""
 
     def reload(self, fleet: Fleet) -> None:
-        """Take the rights and limits of a fleet file that was read again."""
         self._policy, self.limits = fleet.access, fleet.limits
         self._runtimes = fleet.min_runtime, fleet.command_min_runtime
 
     def bound(self, policy: SchedulingPolicy) -> SchedulingPolicy:
-        """Return the policy with the rights and limits that the scheduler enforces. A name in several groups belongs
-        to the first."""
+        """The policy with the rights and limits that the scheduler enforces. A name belongs to the first of its
+        groups."""
         policy = self.limits.bound(policy)
         if policy.fair_shares is not None:
             # Reversed, so that the first group of a name overwrites the others.
@@ -98,7 +97,7 @@ class Authority:
                 raise Refused("not_allowed", f"{owner} has {quota.arcs} open requests, its quota; cancel one")
 
     def highest_priority(self, name: str) -> int | None:
-        """The highest priority that this name may request; None: any."""
+        """None: any."""
         if not self.enforced:
             return None
         most = self._policy.ceiling(name).priority
@@ -108,19 +107,18 @@ class Authority:
         return below if most is None else min(below, most)
 
     def longest_runtime(self, name: str) -> Ns:
-        """The longest minimum runtime that this name may request; 0: any."""
+        """0: any."""
         return (self._policy.ceiling(name).runtime or 0) if self.enforced else 0
 
     def until_done(self, name: str, min_runtime: Ns) -> Ns:
-        """How long a hold of this name for a command is protected; 0: no longer than `min_runtime`. A request that
-        gives less than the fleet's minimum runtime, and so ranks before others, has no more than that."""
+        """How long a hold of this name for a command is protected; 0: for `min_runtime`, if that is less than the
+        fleet's, as the request then ranks before others."""
         usual, most = self._runtimes
         limits = (most, self.longest_runtime(name) or most, self.limits.max_runtime or most)
         return min(limits) if min_runtime >= usual else 0
 
     def starter(self, client: ClientId) -> str:
-        """The name whose quotas count a component's requests: it acts for whoever started it, on the host that the
-        placer chose. Empty: its own host's."""
+        """The name whose quotas count a component's requests: of the person who started it. Empty: its own host's."""
         host, _, name = client.partition("/")
         placement = self.placed.get(name.rpartition(".")[0]) if self.enforced else None
         if placement is None or host not in (placement.host, placement.to):
@@ -131,7 +129,7 @@ class Authority:
         return not self.enforced or "manager" in self._policy.ranks_of(host)
 
     def certified_who(self, sender: Sender, who: Who | None) -> Who | None:
-        """Return `who` with the user of the sender's certificate, in place of the user that it claims to be."""
+        """Return `who` with the user of the sender's certificate, not the user that it claims."""
         return structs.replace(who, user=sender.host) if who is not None and self.enforced else who
 
     def check_hand_over(
@@ -142,7 +140,7 @@ class Authority:
         open_by: Callable[[Collection[str]], int],
         held_by: Callable[[Collection[str]], int],
     ) -> None:
-        """Raises Refused if the new client may not have these ARCs. `open_by`, `held_by`: count the open ARCs of some
+        """Raises Refused if the new client may not have these ARCs. `open_by` and `held_by` count the open ARCs of
         names, and the RCs that they hold."""
         if not self.enforced:
             return
@@ -172,8 +170,8 @@ class Authority:
             self._check_rank(sender.host, what, USERS)
 
     def check_component(self, sender: Sender, operation: ComponentOperation) -> None:
-        """Raises Refused if `sender` may not order this of a node: the placer starts and moves, operators may stop as
-        well, and a component that moves may hand its state to its next incarnation."""
+        """Raises Refused if `sender` may not order this of a node: the placer starts and moves, operators may also
+        stop, and a moving component may hand its state to its next incarnation."""
         if not self.enforced or isinstance(operation, ListComponents | ReadOutput):
             return
         name, _, number = sender.client.rpartition(".")
@@ -193,13 +191,11 @@ class Authority:
         return holders is None or name in holders
 
     def _barred(self, name: str) -> tuple[str, ...]:
-        """The patterns of RCs that this name may not hold."""
         allowed = {name, *self._policy.groups_of(name)}
         barred = (pattern for pattern, names in self._policy.access.items() if not allowed & {*names})
         return tuple(map(as_pattern, barred))
 
     def is_removed(self, client: ClientId) -> bool:
-        """Return True if this client's name no longer has a role that may hold RCs."""
         ranks = self._policy.ranks_of(client.partition("/")[0])
         return self.enforced and not ranks & USERS
 
@@ -208,6 +204,5 @@ class Authority:
             raise Refused("not_allowed", why)
 
     def _refused(self, name: str, what: str) -> Refused:
-        """The refusal of something that operators may do."""
         operators = [operator for operator, ranks in self._policy.ranks.items() if "operator" in ranks]
         return Refused("not_allowed", self._policy.refusal_text(name, what, operators))

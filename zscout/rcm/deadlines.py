@@ -22,7 +22,6 @@ class Deadlines(Generic[T]):
         heapq.heappush(self._heap, (at, next(self._order), value))
 
     def pop_due(self, now: Ns) -> T | None:
-        """Remove and return the earliest due value; None: nothing is due."""
         return heapq.heappop(self._heap)[2] if self._heap and self._heap[0][0] <= now else None
 
     @property

@@ -20,14 +20,14 @@ MAX_NAMED = 8
 
 
 class DeviceCheck:
-    """Checks needs against the devices that a leader knows. Before `settles` an unseen RC may still show up."""
+    """Before `settles` an unseen RC may still show up."""
 
     def __init__(self, devices: ExpectedDevices, roster: Roster, settles: Ns) -> None:
         self._devices, self._roster, self._settles = devices, roster, settles
 
     def check(self, now: Ns, needs: Mapping[Need, Amounts], *, waits: bool = False, may_wait: bool = True) -> None:
-        """Raises Refused for unknown devices and for more RCs of a pattern than match it, unless the request `waits`
-        for them; and for parameters that no matching RC accepts. `may_wait`: the remedy is to wait."""
+        """Raises Refused for parameters that no matching RC accepts; and, unless the request `waits`, for unknown
+        devices and for more RCs than match a pattern. `may_wait`: the remedy is to wait."""
         waits, expected, is_there = waits or now < self._settles, self._devices.names, self._roster.is_known
         wanted = Counter(need.partition("#")[0] for need in needs if is_pattern(need))
         for need, params in needs.items():
@@ -73,7 +73,7 @@ def _unknown(need: Need, known: Collection[RcName], *, may_wait: bool) -> Refuse
 
 
 def _objection(rc: RcName, params: Amounts, parameters: Parameters | None) -> Refused | None:
-    """The refusal for parameters that this RC can never accept."""
+    """The refusal if this RC can never accept these parameters."""
     if parameters is None:
         return None
     bounds = {parameter.name: parameter for parameter in parameters}

@@ -19,8 +19,7 @@ MAX_HOMES: Final = 20_000
 
 
 class SeenHome(msgspec.Struct, frozen=True, omit_defaults=True):
-    """An RC was seen at a host `ago` seconds before this record was written. `why`: the reason that it disappeared, if
-    known."""
+    """An RC was seen at a host `ago` seconds before this record was written. `why` it disappeared, if known."""
 
     rc: str
     host: str
@@ -77,8 +76,6 @@ class ExpectedDevices:
         """Grows with each change that should be stored."""
         self.declare(declared)
 
-    # In
-
     def declare(self, declared: Mapping[HostName, Collection[RcName]]) -> None:
         """Expect the devices of this fleet file instead of the last file's."""
         for device in self._devices.values():
@@ -111,19 +108,17 @@ class ExpectedDevices:
                 self.version += 1
 
     def report(self, state: RcState) -> None:
-        """Take over an RC's own report."""
         if _is_name(state.rc, state.host) and self._home(state.rc, state.host) is not None:
             device = self._devices[state.rc]
             device.sharable, device.parameters = state.sharable, state.parameters
 
     def stopped(self, rc: RcName, host: HostName) -> None:
-        """An RC reports that it was shut down in order."""
         if _is_name(rc, host) and (home := self._home(rc, host)) is not None:
             home.why, home.stopped = f"it is stopped at {host}", True
             self.version += 1
 
     def forget_tokens(self, now: Ns) -> None:
-        """Tokens are no longer followed: no instance counts as seen."""
+        """No instance counts as seen any longer."""
         for device in self._devices.values():
             for home in device.homes.values():
                 if home.instances:
@@ -132,8 +127,7 @@ class ExpectedDevices:
         self._living.clear()
 
     def remember(self, homes: Iterable[SeenHome], now: Ns) -> None:
-        """Take over homes that another host knows, or that this host stored before it restarted. They replace nothing
-        that was seen here later."""
+        """Add homes that another host knows, or that were stored before a restart; what was seen here later stays."""
         for stored in homes:
             seen = now - round(stored.ago * SECOND)
             if now - seen > REMEMBERED or not _is_name(stored.rc, stored.host):
@@ -148,7 +142,7 @@ class ExpectedDevices:
                 device.sharable, device.parameters = stored.sharable, stored.parameters
 
     def _home(self, rc: RcName, host: HostName) -> Home | None:
-        """The home of `rc` at `host`, added if new; None: there are MAX_HOMES already."""
+        """Added if new; None: there are MAX_HOMES already."""
         device = self._devices.get(rc)
         home = device.homes.get(host) if device is not None else None
         if home is None and self._count < MAX_HOMES:
@@ -158,8 +152,7 @@ class ExpectedDevices:
         return home
 
     def forget_old(self, now: Ns) -> None:
-        """Remove homes that are no longer expected: not in the fleet file, and unseen for a day, or shut down while the
-        RC is seen at another host."""
+        """Remove homes not in the fleet file that are unseen for a day, or shut down while the RC is seen elsewhere."""
         for rc, device in list(self._devices.items()):
             for host, home in list(device.homes.items()):
                 old = home.seen is None or now - home.seen > REMEMBERED
@@ -170,10 +163,7 @@ class ExpectedDevices:
             if not device.homes:
                 del self._devices[rc]
 
-    # Out
-
     def homes(self, now: Ns) -> list[SeenHome]:
-        """All homes where an RC is or was seen, for storing."""
         return [
             SeenHome(rc, host, _ago(home, now), home.why, home.stopped, device.sharable, device.parameters)
             for rc, device in sorted(self._devices.items())
@@ -183,7 +173,6 @@ class ExpectedDevices:
 
     @property
     def names(self) -> KeysView[RcName]:
-        """All RCs that are seen or expected."""
         return self._devices.keys()
 
     def latest_home(self, rc: RcName) -> HostName | None:
@@ -202,7 +191,6 @@ class ExpectedDevices:
         return device.parameters if device is not None else None
 
     def why_gone(self, rc: RcName, host: HostName) -> str:
-        """The reason that no instance of `rc` is at `host`, as text for people."""
         home = self._devices[rc].homes.get(host) if rc in self._devices else None
         if home is not None and home.why:
             return home.why
@@ -211,8 +199,8 @@ class ExpectedDevices:
         return f"it is gone from {host}" if host in self._living else f"the node of {host} is gone"
 
     def view(self, known: RcView, now: Ns, named: HostName | None) -> RcView:
-        """The RC for `status` and the web page. `known`: its state by the scheduler and its own report; `named`: the
-        host of its named instance."""
+        """The RC for `status` and the web page. `known`: by scheduler and its report; `named`: its named instance's
+        host."""
         device = self._devices.get(known.rc, _Device())
         living = sorted(host for host, home in device.homes.items() if home.instances)
         gone = {host: home for host, home in device.homes.items() if not home.instances}

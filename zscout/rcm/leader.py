@@ -95,8 +95,8 @@ class Leader:
         self._out = steps.Outbox()
 
     def step(self, now: Ns, stimuli: Iterable[steps.Stimulus] = ()) -> Iterator[steps.Outbox]:
-        """Decide one instant, and yield its Outbox in parts. Carry out each before taking the next; a leader that stops
-        leading takes no further part."""
+        """Yield the Outbox of this instant in parts. Carry out each before taking the next; stop when no longer
+        leading."""
         self._now, out = now, steps.Outbox()
         self._out = out
         self._bookings.at(now)
@@ -118,10 +118,7 @@ class Leader:
         out.more = bool(self._queue)
         yield out
 
-    # In
-
     def _next(self) -> list[model.Event]:
-        """The events of the next instant."""
         operations, queue, out = self.operations, self._queue, self._out
         while queue and isinstance(asked := queue[0], steps.OperationAsked) and operations.can_join(asked):
             queue.popleft()
@@ -190,7 +187,6 @@ class Leader:
         return []
 
     def _names_in_a_row(self, rc: RcName) -> set[RcName]:
-        """`rc`, and the RCs of the `Name` stimuli that follow directly."""
         rcs = {rc}
         while self._queue and isinstance(name := self._queue[0], steps.Name):
             rcs.add(name.rc)
@@ -214,13 +210,12 @@ class Leader:
         self._out.merge(self.registry.tick(self._now))
 
     def _reload(self) -> list[model.Event]:
-        """The rights have changed: end the ARCs of clients that have no role any more."""
+        """End the ARCs of clients that have lost their role."""
         self.core.policy = self.admission.authority.bound(self._fleet.scheduling)
         known = filter(None, map(self.core.arc, self.core.arcs()))
         return [model.Tick(), *removed((arc.request for arc in known), self.admission)]
 
     def _begin_term(self, recovered: RecoveredState) -> None:
-        """Begin the term with the recovered holds and requests."""
         now, registry, places = self._now, self.registry, self.admission.places
         joined = self.roster.start(now, recovered.rcs.values(), recovered.pending, patient=recovered.patient)
         for arc in recovered.given_up:
@@ -261,8 +256,8 @@ class Leader:
         return events + beginnings(state, holders, self._now, self._fleet.timing.hold_lease)
 
     def _compare_listed(self, answer: messages.ClientRequests) -> list[model.Event]:
-        """Compare a client's list with its ARCs that only RCs reported: release those that it no longer lists, as no
-        RCM received its release, and take over the client's own words for the others."""
+        """Release a client's ARCs that only RCs reported and it no longer lists, as no RCM received its release;
+        replace the RCs' words about the others by its own."""
         known = self._recovered.pop(answer.client, set()) & {*self.core.arcs_of(answer.client)}
         listed = {asked.id: asked for asked in answer.requests[: self.admission.limits.max_requests_per_client]}
         events = list[model.Event]()
@@ -281,20 +276,18 @@ class Leader:
         return events
 
     def _await_list(self, request: model.ArcRequest) -> None:
-        """Ask a client for its requests, to learn if it still wants this ARC, which only RCs have reported."""
+        """Ask a client if it still wants this ARC, which only RCs have reported."""
         self._recovered.setdefault(request.client, set()).add(request.arc)
         self._out.merge(self.roster.ask_requests(self._now, request.client))
 
-    # Out: one instant
-
     def _decide(self, events: Sequence[model.Event], extra_rcs: Collection[RcName] | None = None) -> None:
-        """Decide an instant in one part. `extra_rcs` are published even if they did not change."""
+        """`extra_rcs` are published even if they did not change."""
         if (instant := self._grant(events, extra_rcs)) is not None:
             self._publish_instant(instant)
             self._follow_up(instant)
 
     def _grant(self, events: Sequence[model.Event], extra_rcs: Collection[RcName] | None = None) -> _Instant | None:
-        """Decide these events, and answer and notify the clients of granted ARCs. Return None if nothing changes."""
+        """Answer and notify the clients of granted ARCs first. Return None if nothing changes."""
         lost = [event.client for event in events if isinstance(event, model.ClientLost)]
         for client in lost:
             self._recovered.pop(client, None)
@@ -323,7 +316,6 @@ class Leader:
         self._publish(instant.effects, instant.extra_rcs, self.operations.instant.left)
 
     def _follow_up(self, instant: _Instant) -> None:
-        """Everything that follows from an instant after its grants and publication."""
         events, effects, _, notified = instant
         now, out, registry, operations = self._now, self._out, self.registry, self.operations
         self._record(events)
@@ -346,7 +338,6 @@ class Leader:
         out.over, registry.traced = registry.traced, []
 
     def _record(self, events: Iterable[model.Event]) -> None:
-        """Update owners of places, history and awaited clients by the events of an instant."""
         now = self._now
         for event in events:
             match event:
@@ -377,13 +368,11 @@ class Leader:
         if (place := self.core.place_of(arc)) is not None:
             self.admission.places.bind(place, arc, self._now)
 
-    # Out: grants and proposals
-
     def _publish(
         self, effects: Iterable[model.Effect], rcs: Collection[RcName] | None = None, left: Collection[ArcId] = ()
     ) -> None:
-        """Publish all holders of the granted or revoked RCs that have joined, if there are any. With `rcs`, publish in
-        any case, and the holders of `rcs` too. `left`: ARCs whose own client reported that the program is gone."""
+        """Publish all holders of the granted or revoked RCs that have joined, if any, and in any case those of `rcs`.
+        `left`: ARCs whose own client reported that the program is gone."""
         changed = [e for e in effects if isinstance(e, (model.Granted, model.HoldTimed, model.HoldEnded))]
         if not changed and rcs is None:
             return

@@ -53,8 +53,6 @@ class _StateAsk(NamedTuple):
 
 @dataclass(slots=True)
 class _Instant:
-    """Operations gathered for one instant."""
-
     touched: set[ArcId] = field(default_factory=set)
     ended: list[model.Cancelled | model.Released] = field(default_factory=list)
     shown: list[model.Event] = field(default_factory=list)
@@ -69,8 +67,6 @@ class _Instant:
 
 
 class Operations:
-    """Checks operations, gathers an instant of them, and keeps the tickets of operations without an answer."""
-
     def __init__(
         self,
         fleet: Fleet,
@@ -98,10 +94,7 @@ class Operations:
         self._hand_over_count = 0
         self._deadlines: Deadlines[tuple[_Due, Any]] = Deadlines()
 
-    # In
-
     def can_join(self, asked: OperationAsked) -> bool:
-        """Return True if an operation can join the instant that is being gathered."""
         instant, operation = self.instant, asked.operation
         if not instant.touched:
             return True
@@ -118,7 +111,6 @@ class Operations:
         return False
 
     def take(self, now: Ns, asked: OperationAsked) -> Outbox:
-        """Add an operation to the instant, or answer, defer or refuse it at once."""
         self._now = now
         ticket, sender, operation = asked
         client = str(sender)
@@ -141,11 +133,10 @@ class Operations:
         return out
 
     def events(self) -> list[model.Event]:
-        """The events of the instant: ends come first, new requests last."""
+        """Ends come first, new requests last."""
         return [*self.instant.ended, *self.instant.shown, *self.instant.asked]
 
     def resume(self) -> list[OperationAsked]:
-        """The deferred operations, to be taken again."""
         deferred, self._deferred = self._deferred, []
         return deferred
 
@@ -167,7 +158,6 @@ class Operations:
         return self._deadlines.next
 
     def tick(self, now: Ns) -> Outbox:
-        """First answers that are due, and deferred operations."""
         out = Outbox()
         while (due := self._deadlines.pop_due(now)) is not None:
             match due:
@@ -176,8 +166,6 @@ class Operations:
                 case _Due.RESUME, _:
                     out.then += self.resume()
         return out
-
-    # Out: the instant is decided
 
     def decided(self, now: Ns, effects: Iterable[model.Effect]) -> Outbox:
         """The answers of an instant other than to grants, and notices to the new clients of ARCs handed over."""
@@ -202,15 +190,12 @@ class Operations:
         return out
 
     def answers(self, now: Ns, arcs: Iterable[ArcId]) -> list[Answer]:
-        """The answers to the operations on these ARCs that wait for one."""
         answers = list[Answer]()
         for arc in arcs:
             if tickets := self.waiting.pop(arc, None):
                 notice = self._registry.notice(now, arc)
                 answers += [(ticket, notice) for ticket in tickets]
         return answers
-
-    # Asking
 
     def _ask(self, asked: OperationAsked, ask: Ask, sender: Sender, client: ClientId) -> None:
         self._check_term(ask, sender, client)
@@ -311,7 +296,7 @@ class Operations:
         return None
 
     def _may_hold(self, arc: ArcId, ask: Ask) -> bool:
-        """Return True if its client believes in a grant of an earlier RCM that is unknown here."""
+        """Return True if it `_believes` in a hold that is unknown here."""
         known = self.core.arc(arc)
         return self._believes(ask) and (known is None or known.hold is None) and not self._registry.ended(arc)
 
@@ -320,8 +305,7 @@ class Operations:
         return ask.grant is not None and ask.grant.term < self.core.term and not (ask.unconfirmed or ask.unserved)
 
     def _denied(self, arc: ArcId, ask: Ask, sender: Sender) -> model.Vouched | None:
-        """The client's own request, if it denies the hold that an RC reported: it believes in another grant of an
-        earlier RCM, for other RCs. None: it does not."""
+        """The client's own request, if it denies the hold that an RC reported for another grant of an earlier RCM."""
         known = self.core.arc(arc)
         if known is None or known.vouched or known.hold is None or known.hold.grant == ask.grant:
             return None
@@ -339,8 +323,6 @@ class Operations:
     def _defer(self, asked: OperationAsked) -> None:
         self._deferred.append(asked)
         self._deadlines.set(self._now + self._lease, (_Due.RESUME, None))
-
-    # Ending
 
     def _end(self, ticket: Ticket, operation: Cancel | Release, sender: Sender) -> None:
         owner = client_of(operation.client) if operation.client is not None else sender
@@ -361,8 +343,6 @@ class Operations:
         instant.ended.append(event(arc, by))
         self.waiting.setdefault(arc, []).append(ticket)
 
-    # Open requests, as limits and quotas count them: with the requests of this instant
-
     @property
     def waiting_now(self) -> int:
         return self.core.waiting + len(self.instant.asked)
@@ -377,11 +357,8 @@ class Operations:
         return owned - sum(arc.request.owner in names for arc in excluded)
 
     def held_by(self, names: Collection[str], *but: ArcId) -> int:
-        """The number of RCs held by these owners."""
         arcs = filter(None, map(self.core.arc, {*self.core.arcs_of_owners(names)} - {*but}))
         return sum(len(arc.needs) for arc in arcs if arc.hold is not None)
-
-    # Dry runs
 
     def _forecast(self, ticket: Ticket, asked: Foresee, sender: Sender) -> None:
         arc, now = arc_id(str(sender), asked.id), self._now
@@ -405,8 +382,6 @@ class Operations:
         )
         self._out.at_once.append((ticket, answer))
 
-    # Handing over
-
     def _find_new_client(self, asked: OperationAsked, operation: HandOver, sender: ClientId) -> None:
         to = str(client_of(operation.to))
         for other in operation.others:
@@ -429,7 +404,7 @@ class Operations:
             self._out.merge(self._roster.find_client(self._now, to, self._hand_over_count))
 
     def _hand_over(self, ticket: Ticket, operation: HandOver, sender: ClientId, to: ClientId) -> None:
-        """Hand over all its ARCs in one instant and one publication, so that no other request gets them in between."""
+        """Hand over all its ARCs in one instant, so that no other request gets them in between."""
         moves = self._arcs_to_move(operation, sender, to)
         if not moves or moves[0].arc != arc_id(sender, operation.id):
             self._answer_handed_over(ticket, operation, sender, to)
@@ -452,7 +427,7 @@ class Operations:
         instant.touched |= {move.arc for move in moves}
 
     def _arcs_to_move(self, operation: HandOver, sender: ClientId, to: ClientId) -> list[model.HandedOver]:
-        """The ARCs to move: of the ARCs that the operation names, those open at the sender. Raises Refused."""
+        """The named ARCs that are open at the sender. Raises Refused."""
         moves = []
         for name in dict.fromkeys((operation.id, *operation.others)):
             arc = self.core.arc(arc_id(sender, name))
@@ -467,7 +442,7 @@ class Operations:
         return moves
 
     def _answer_handed_over(self, ticket: Ticket, operation: HandOver, sender: ClientId, to: ClientId) -> None:
-        """Answer a repeated hand-over. Raises Refused if it was never carried out."""
+        """Raises Refused if it was never carried out."""
         goal = arc_id(to, operation.id)
         over = self._registry.ended(goal) and self._registry.ended(arc_id(sender, operation.id))
         if self.core.arc(goal) is None and not over:

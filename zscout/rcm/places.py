@@ -22,7 +22,6 @@ def arc_id(client: str, request_id: str) -> ArcId:
 
 
 def request_id(arc: ArcId) -> str:
-    """The client's own id in an ArcId."""
     return arc.rpartition("/")[2]
 
 
@@ -53,8 +52,8 @@ class Places:
         return hmac.digest(self._key, sealed.encode(), "sha256").hex()[:32]
 
     def may_claim(self, place: Place, client: ClientId, id_: str, seal: str | None, *, seen: bool) -> bool:
-        """Return True if `client` owns this place, for its ARC of this id. Without a key it owns a place of an earlier
-        term that no client has shown before, if its token is `seen`."""
+        """Return True if `client` owns this place for its ARC of this id. Without a key, a client whose token is `seen`
+        owns a place of an earlier term that it is the first to show."""
         owners = self._owners.get(place)
         if owners is not None and client in owners:
             return True

@@ -83,7 +83,7 @@ class RecoveredState:
 
 
 def aged(state: RcState, by: Ns) -> RcState:
-    """The answer that an RC gave `by` ago, with its times brought forward to now."""
+    """The answer that an RC gave `by` ago, with its times as of now."""
     return replace(state, holders=[_aged(holder, by / SECOND) for holder in state.holders])
 
 
@@ -100,7 +100,6 @@ def begin_within(state: RcState) -> Ns | None:
 
 
 def longest_begin(state: RcState, hold_lease: Ns) -> Ns:
-    """The time after which an RC must have begun, with settling included."""
     return (begin_within(state) or 0) + hold_lease + round((state.settle or 0) * SECOND)
 
 
@@ -113,8 +112,8 @@ def take_over(
     record_of: Callable[[str], BookingRecord | None] = lambda _: None,
 ) -> RecoveredState:
     """Recover the state for a new leader. RCs whose gangs have not all answered are `pending`: their holds are not
-    decided. `home_of`: the host at which the fleet file has an RC; an RC that is free elsewhere is admitted later, as
-    its device may still be in use at home. `record_of`: the known record of a booking."""
+    decided. `home_of`: the host of an RC by the fleet file; an RC free elsewhere joins later, as its device may be in
+    use at home."""
     states = [state for state in states if state.holders or home_of(state.rc) in (None, state.host)]
     # Of two instances of an RC, name the instance with the newest hold, else the one at home.
     by_host = sorted(states, key=attrgetter("host", "instance"), reverse=True)
@@ -138,7 +137,7 @@ def _newest_grant(state: RcState) -> Grant:
 
 
 def gangs_of(rc: RcName, states: Mapping[RcName, RcState]) -> set[RcName]:
-    """`rc`, the RCs that hold ARCs together with it by `states`, the RCs that hold ARCs with those, and so on."""
+    """The RCs that hold ARCs together with it, directly or through others, and itself."""
     found, left = set[RcName](), {rc}
     while left:
         member = left.pop()
@@ -146,9 +145,6 @@ def gangs_of(rc: RcName, states: Mapping[RcName, RcState]) -> set[RcName]:
         if member in states:
             left |= {other for holder in states[member].holders for other in holder.rcs} - found
     return found
-
-
-# Listed requests
 
 
 class Listed(NamedTuple):
@@ -173,7 +169,7 @@ def _listed(
     admission: Admission,
     record_of: Callable[[str], BookingRecord | None],
 ) -> dict[ArcId, Listed]:
-    """The valid requests, for each client no more than it may have open. Notes the others in `result`."""
+    """The valid requests, at most as many per client as it may have open. Notes the others in `result`."""
     found, most = dict[ArcId, Listed](), admission.limits.max_requests_per_client
     for answer in clients:
         if len(answer.requests) > most:
@@ -216,8 +212,8 @@ def _admit_waiting(
     now: Ns,
     admission: Admission,
 ) -> None:
-    """Admit the waiting requests with the checks of an Ask, the earliest places first. `held_places`: places and ids of
-    recovered holds. `undecided`: holds of pending RCs, which may yet continue; their requests are clamped instead."""
+    """Admit the waiting requests as Asks, the earliest places first. `held_places`: places and ids of recovered holds.
+    `undecided`: holds of pending RCs, which may continue; their requests are clamped instead."""
     admitted, running = Admitted(), {held.request.arc for held in result.holds}
     for held in result.holds:
         admitted.add(held.request, waits=False)
@@ -242,9 +238,6 @@ def _admit_waiting(
             result.waiting.append(Requested(request, known.place, now - round(known.waited * SECOND)))
             if known.grant is not None:
                 result.believed[request.arc] = known.grant, known.rcs
-
-
-# Reported holds
 
 
 _Reported: TypeAlias = tuple[ArcId, Grant, tuple[RcName, ...]]
@@ -324,8 +317,8 @@ def _hold(
     admission: Admission,
     waits: Mapping[RcName, Ns | None],
 ) -> RecoveredHold | None:
-    """The hold that these RCs report, with the request that its client lists (`own`), if it answered. `some`: the
-    report with the most details. None: the client requests something else. Raises BadName, ValueError."""
+    """The hold that these RCs report, with its client's request (`own`), if listed; `some`: the fullest report. None:
+    the client requests something else. Raises BadName, ValueError."""
     left = round(min(holder.remaining for holder in held.values()) * SECOND)
     end = max([now, *filter(None, waits.values())]) + left
     direct = any(holder.direct for holder in held.values()) or (own is not None and own.request.direct)
@@ -361,8 +354,7 @@ def _runtime(held: Mapping[RcName, Holder], request: ArcRequest) -> Ns | None:
 
 
 def _waits(held: Mapping[RcName, Holder], states: Mapping[RcName, RcState], now: Ns) -> dict[RcName, Ns | None]:
-    """The RCs that have not begun, with the latest time at which they begin; empty if the version of one of them is too
-    old to report that."""
+    """The RCs that have not begun, with the latest time of their begin; empty if an RC's version does not report it."""
     if any(states[rc].begin_within is None for rc in held):
         return {}
     most = {rc: longest_begin(states[rc], LONGEST_LEASE) for rc in held}
@@ -380,7 +372,6 @@ def _protected_from(held: Mapping[RcName, Holder], now: Ns) -> Ns | None:
 
 
 def _agree(needs: Mapping[Need, Params], bound: Mapping[Need, RcName], held: Mapping[RcName, Holder]) -> bool:
-    """Return True if the RCs report the parameters that the client requested."""
     by_rc = _by_rc(needs, bound)
     return all(exact_amounts(holder.params) == by_rc[rc] for rc, holder in held.items())
 
@@ -463,17 +454,12 @@ def adopted(
 
 
 def removed(requests: Iterable[ArcRequest], admission: Admission) -> list[Released]:
-    """The events that end the ARCs of clients without a role."""
     gone = [request.arc for request in requests if admission.authority.is_removed(request.client)]
     return [Released(arc, REMOVED) for arc in gone]
 
 
-# Late answers of clients
-
-
 def vouched(status: ArcStatus, own: Listed, admission: Admission) -> Vouched:
-    """The event with the client's own request for an ARC that only RCs reported. Raises Refused if the ARC waits, and
-    its client may not request it."""
+    """The event for an ARC that only RCs reported. Raises Refused if it waits, and its client may not request it."""
     if status.hold is None:
         admission.authority.check_ask(client_of(own.request.client).host, own.request, lambda _: 0)
     bound = binding(own.request.needs, status.needs, {})

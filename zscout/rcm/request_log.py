@@ -64,8 +64,6 @@ def upcoming_info(end: UpcomingEnd, now: Ns) -> messages.Upcoming:
 
 @dataclass(slots=True)
 class _Request:
-    """The record of an ARC."""
-
     name: str
     estimated: bool = False
     """Its notices include when it will start."""
@@ -85,7 +83,7 @@ class RequestLog:
     def __init__(self, core: Core, roster: Roster, places: Places, runtimes: RuntimeEstimator | None) -> None:
         self._core, self._roster, self._places = core, roster, places
         self._runtimes = runtimes
-        self._step = 0  # number of the last notice
+        self._step = 0
         self._requests: dict[ArcId, _Request] = {}
         self._ended: OrderedDict[ArcId, None] = OrderedDict()  # ended ARCs, in the order of their ends
         self._changed: dict[ArcId, None] = {}
@@ -104,7 +102,7 @@ class RequestLog:
         self._log_at: Ns | None = None
 
     def enter(self, arc: ArcId, name: str, *, estimate: bool = False) -> None:
-        """Set the name of `arc`; with `estimate` its notices include the estimated start."""
+        """With `estimate` its notices include the estimated start."""
         known = self._requests.get(arc)
         if known is None or known.until is not None:
             known = self._requests[arc] = _Request(name)
@@ -113,7 +111,6 @@ class RequestLog:
         known.estimated |= estimate
 
     def rename(self, arc: ArcId, renamed: ArcId) -> None:
-        """`arc` is handed over, under the new id `renamed`."""
         known = self._requests.get(arc)
         self.enter(renamed, self.name(arc))
         if known is not None and self._core.is_queued(arc):
@@ -154,8 +151,8 @@ class RequestLog:
         return believed not in (None, ended.grant) and self.may_be_held(now, ended.arc)
 
     def reopens(self, arc: ArcId, unserved: Grant | None = None) -> bool:
-        """Return True if `arc` may be requested again, and forget its end: it ended only because its client seemed
-        lost, or it was completed under the grant `unserved` while RCs of it settled."""
+        """Return True if `arc` may be requested again, and forget its end: its client seemed lost, or it was completed
+        under the grant `unserved` while RCs of it settled."""
         if (notice := self._ending(arc)) is None:
             return False
         completed = notice.outcome == Outcome.COMPLETED and notice.grant is not None and notice.grant == unserved
@@ -176,10 +173,7 @@ class RequestLog:
             # Without its grant it is not reopened as `unserved` either.
             self._requests[arc].ending = replace(notice, grant=None)
 
-    # Notices
-
     def notice(self, now: Ns, arc_id: ArcId) -> Notice:
-        """The present state of a request, or how it ended."""
         arc = self._core.arc(arc_id)
         if arc is None:
             return self._ending(arc_id) or self._notice(arc_id, "ended", reason="no such request is open")
@@ -219,8 +213,8 @@ class RequestLog:
         return [upcoming_info(end, now) for end in ends]
 
     def interrupted(self, now: Ns, arc: ArcId, believed: Grant) -> Notice:
-        """The state of a queued request whose client believes in a hold: with the end of that hold, or as lost if its
-        end is not known here."""
+        """The state of a queued request whose client believes in a hold: with its end, as lost if that is unknown
+        here."""
         known = self._requests.get(arc)
         notice, ending = self.notice(now, arc), None if known is None else known.ending
         if ending is None or ending.grant != believed:
@@ -245,7 +239,6 @@ class RequestLog:
         )
 
     def refuse(self, now: Ns, arc: ArcId, name: str, problem: Problem) -> Notice:
-        """The notice that a listed request is refused."""
         reason = f"the leader refuses it: {problem.message}"
         self.record(now, arc, reason)
         return replace(self._notice(arc, "ended", reason=reason, outcome=Outcome.LOST, problem=problem), arc=name)
@@ -253,8 +246,8 @@ class RequestLog:
     def report(
         self, now: Ns, effects: Iterable[Effect], answered: Collection[ArcId], given_up: Collection[ArcId]
     ) -> list[Notice]:
-        """The notices of an instant's effects, except those that repeat the answer to an operation: the grant of an
-        `answered` ARC, the end of the hold of a `given_up` ARC."""
+        """The notices of an instant's effects that no answer to an operation gave: not the grants of `answered` ARCs,
+        nor the ends of `given_up` ones."""
         notices = []
         self.first_estimates.clear()
         for effect in effects:
@@ -297,7 +290,6 @@ class RequestLog:
 
     @property
     def next(self) -> Ns | None:
-        """The time at which `tick` is due."""
         return min((at for at in (self._report_at, self._log_at) if at is not None), default=None)
 
     def tick(self, now: Ns) -> Outbox:
@@ -317,13 +309,12 @@ class RequestLog:
         return out
 
     def _upcoming_notices(self, now: Ns) -> list[Notice]:
-        """The notices of holds whose upcoming ends changed since the last notice."""
         holds = (arc for arc in self._core.contended_holds() if self._is_vouched(arc))
         changed = [arc for arc in holds if self._core.upcoming(arc) != self._upcoming.get(arc, ())]
         return [self.notice(now, arc) for arc in changed]
 
     def _close(self, now: Ns, effect: HoldEnded | Dropped) -> Notice:
-        """Record the end of a hold or of a queued request. Unless it is queued again, the request has ended with it."""
+        """Unless it is queued again, the request has ended with the hold."""
         why = reason_info(effect.reason, now)
         details: dict[str, Any] = {"reason": str(effect.reason), "outcome": effect.outcome, "why": why}
         self._upcoming.pop(effect.arc, None)
@@ -355,11 +346,8 @@ class RequestLog:
         until = self._requests[arc].until
         return until is not None and until < now
 
-    # Forecasts
-
     def starts(self, now: Ns) -> Mapping[ArcId, Ns]:
-        """By queued ARC: its start, forecast from the present state; absent: not within the forecast. One
-        forecast serves the whole instant."""
+        """By queued ARC, forecast once for the whole instant; absent: not within the forecast."""
         if self._forecast is None or self._forecast[0] != self._core.batches:
             self._starts = forecast(self._core, now, None, self._runtimes).starts
             self._forecast = self._core.batches, now
@@ -379,8 +367,6 @@ class RequestLog:
             known.first_estimate = start
         return max(0, start - now) / SECOND
 
-    # History
-
     def record(self, now: Ns, arc: ArcId, text: str) -> None:
         name = self.name(arc)
         self._lines.append((now, arc, name, text))
@@ -398,7 +384,6 @@ class RequestLog:
         return lines[-MAX_ANSWERED:]
 
     def close(self, now: Ns) -> str:
-        """The last lines for the log, when the term is over."""
         self._record_reasons(now)
         return self._log_text()
 

@@ -81,8 +81,6 @@ class _Pending:
 
 @dataclass(slots=True)
 class _Rc:
-    """The record of one RC."""
-
     tokens: dict[str, Token] = field(default_factory=dict)
     """By instance: the tokens that are seen."""
     seen: Ns | None = None
@@ -144,11 +142,9 @@ class Roster:
         self._now = now
         self._out = Outbox()
 
-    # In
-
     def start(self, now: Ns, rcs: Iterable[RcState], pending: Iterable[RcState], *, patient: bool) -> Outbox:
-        """Begin with RCs that promised before the term began; `pending` ones are admitted later. `patient`: the other
-        RCs of their gangs have a lease to answer."""
+        """Begin with RCs that promised before the term began. `patient`: the gangs of `pending` RCs have a lease to
+        answer."""
         self._now = now
         joined, waiting = list(rcs), list(pending)
         alone = all(state.host == self.sight.me for state in (*joined, *waiting))
@@ -208,8 +204,8 @@ class Roster:
         return self._take_outbox()
 
     def shun(self, now: Ns, token: Token, until: Ns) -> Outbox:
-        """An RC shows a term that is not believed: it counts as absent until `until`, unless a leader of that term soon
-        appears. The RC may have promised that term to another candidate."""
+        """Count an RC with a term not believed as absent until `until`, unless that term's leader soon appears: the RC
+        may have promised it to another candidate."""
         self._now = now
         if until > now and token.instance not in self.shunned:
             self.shunned.add(token.instance)
@@ -218,8 +214,7 @@ class Roster:
         return self._take_outbox()
 
     def expect(self, now: Ns, client: ClientId) -> None:
-        """Give a client with requests a lease to show a token. After that it is lost, unless it answers or its session
-        is seen."""
+        """Give a client with requests a lease to show a token, to answer, or to show its session."""
         if client not in self._token_due and client not in self.clients:
             self._expect(now, client)
 
@@ -236,7 +231,7 @@ class Roster:
         return self._take_outbox()
 
     def find_client(self, now: Ns, client: ClientId, number: int) -> Outbox:
-        """Find out if a client has a token, which a new leader may not have seen yet. Leads to a `ClientFound`."""
+        """Find out if a client has a token that is not seen yet. Leads to a `ClientFound`."""
         self._now = now
         if client in self.clients:
             self._out.then.append(ClientFound(number, there=True))
@@ -245,11 +240,10 @@ class Roster:
         return self._take_outbox()
 
     def client_word(self, client: ClientId, term: Term) -> Word:
-        """The evidence that a client obeys `term`, by its own word."""
         return Word(term, Source.CLIENT, client, client_of(client).host if client in self.clients else "")
 
     def ask_requests(self, now: Ns, client: ClientId) -> Outbox:
-        """Ask a client for its requests, until it answers or is lost."""
+        """Repeated until it answers or is lost."""
         self._now = now
         if client not in self._asked:
             self._asked.add(client)
@@ -283,7 +277,6 @@ class Roster:
         return self._take_outbox()
 
     def seen(self, now: Ns, asked: Question, tokens: Sequence[Token]) -> Outbox:
-        """Handle the tokens that a question found."""
         self._now = now
         if asked.purpose is Purpose.FIND_CLIENT:
             found = any(f"{token.host}/{token.name}" == asked.client for token in tokens)
@@ -295,7 +288,6 @@ class Roster:
         return self._take_outbox()
 
     def tick(self, now: Ns) -> Outbox:
-        """Carry out the deadlines that are over."""
         self._now = now
         while (due := self._deadlines.pop_due(now)) is not None:
             match due:
@@ -327,14 +319,10 @@ class Roster:
 
     @property
     def next(self) -> Ns | None:
-        """When the next deadline is over."""
         return self._deadlines.next
-
-    # Out: what is known
 
     @property
     def closed(self) -> bool:
-        """Return True if all members prove their names."""
         return self._keys.closed
 
     def has_joined(self, name: RcName) -> bool:
@@ -343,7 +331,6 @@ class Roster:
         return rc.pending is None and (rc.joined or rc.departed) is not None
 
     def reported(self, name: RcName) -> RcState | None:
-        """The last report of an RC that counts as present."""
         return self._rcs.get(name, _UNKNOWN).joined
 
     def is_known(self, name: RcName) -> bool:
@@ -352,13 +339,12 @@ class Roster:
         return bool(rc.joined or rc.pending or rc.tokens)
 
     def named(self, names: Iterable[RcName]) -> dict[RcName, tuple[str, HostName]]:
-        """The named instance of each of these RCs, and its host."""
         return {name: known for name in names if (known := self._rcs.get(name, _UNKNOWN).named) is not None}
 
     def awaits(self, now: Ns, arc: ArcId, names: Iterable[RcName]) -> bool:
-        """Return True if `arc` may still turn out to hold one of these RCs: it is pending; or has not answered, and its
-        token was first seen less than a lease ago, or none is seen and this term learned of the ARC less than a
-        lease ago. A lease through which this leader stalled does not count."""
+        """Return True if `arc` may still turn out to hold one of these RCs: it is pending; or it has not answered
+        within a lease since its token was first seen, or since the ARC was learned of if none is seen. A lease in which
+        this leader stalled does not count."""
         self._now = now
         for name in names:
             rc = self._rcs.get(name, _UNKNOWN)
@@ -370,8 +356,6 @@ class Roster:
             if rc.joined is None and since is not None and (now - since < self.sight.lease or self._stalled_recently):
                 return True
         return False
-
-    # Clients
 
     def _expect(self, now: Ns, client: ClientId) -> None:
         at = now + self.sight.lease
@@ -409,8 +393,6 @@ class Roster:
         self._token_due.pop(client, None)
         self._probe(self._keys.requests(client_of(client)), ClientRequests, client=client)
         self._out.events.append(ClientLost(client))
-
-    # Tokens that disappear
 
     def _judge_later(self, name: str, token: Token) -> None:
         self._lost_tokens.append((name, token))
@@ -459,7 +441,6 @@ class Roster:
         return bool(witnesses)
 
     def _lose_doubted(self) -> None:
-        """This leader was not away: clients and RCs whose tokens disappeared are lost."""
         doubted, self._doubted_clients = self._doubted_clients, set()
         for client in sorted(doubted):
             if client in self._token_due:
@@ -471,7 +452,6 @@ class Roster:
         return self.sight.stalled_recently(self._now)
 
     def _witnesses(self) -> list[tuple[str, type[Struct]]]:
-        """One key of each other host that is seen, on which it answers."""
         clients = map(client_of, self.clients)
         keys: dict[HostName, tuple[str, type[Struct]]] = {
             client.host: (self._keys.requests(client), ClientRequests) for client in clients
@@ -491,8 +471,6 @@ class Roster:
         self._out.strange.append((token.host, text))
         return False
 
-    # Contradictions of the mesh
-
     def _probe(self, key: str, kind: type[Struct], *, client: ClientId = "", token: Token | None = None) -> None:
         fresh = key not in self._probed
         if not fresh or len(self._probed) < MAX_PROBED:
@@ -504,10 +482,7 @@ class Roster:
                 self._set(PROBE_PERIOD, _Due.ASK_AGAIN, asked)
 
     def _is_seen(self, asked: Question) -> bool:
-        """Return True if the client or RC that is probed shows a token again."""
         return asked.client in self.clients if asked.token is None else bool(self._rcs[asked.token.name].tokens)
-
-    # RCs
 
     def _token_came(self, rc: _Rc, token: Token) -> None:
         rc.tokens[token.instance] = token
@@ -525,7 +500,6 @@ class Roster:
             self._out.then.append(Name(token.name))
 
     def _replace_instance(self, rc: _Rc, token: Token) -> None:
-        """A new instance on the same host replaces its predecessor."""
         rc.joined, rc.named = None, (token.instance, token.host)
         self._out.events.append(RcLost(token.name, "it restarted"))
         self._out.then.append(Name(token.name))
@@ -578,8 +552,7 @@ class Roster:
         return self._awaited.get(arc)
 
     def _may_join(self, rc: _Rc, token: Token) -> bool:
-        """Return True if an instance with a token may join: as the first of its RC, or as the successor of one on the
-        same host."""
+        """Return True if an instance may join: the first of its RC, or the successor of one on the same host."""
         if token.instance not in rc.tokens or token.instance in self.shunned:
             return False
         present = rc.pending.state if rc.pending is not None else rc.joined
@@ -591,7 +564,7 @@ class Roster:
         return home in (None, token.host) or rc.named is not None or self._now >= self._home_until
 
     def _promise_answered(self, token: Token, state: Any, problem: Problem | None) -> None:
-        """Handle the answer of an RC that was asked for its promise; an RC that does not promise is asked again."""
+        """An RC that does not promise is asked again."""
         rc = self._rcs[token.name]
         if problem is not None and problem.term is not None:
             self._note_rc_term(rc, token.name, token.instance, problem.term)
@@ -624,9 +597,8 @@ class Roster:
             self._admit_settled()
 
     def _admit_settled(self) -> None:
-        """Admit pending RCs whose gangs have answered. Others wait a lease after the last answer from their gangs; but
-        only `rebuild`, the time of an answer, if no missing RC has a token and all links of this leader existed when it
-        began."""
+        """Admit pending RCs whose gangs have answered. Others wait a lease after the last answer from their gangs; or
+        only `rebuild`, if no missing RC has a token and all links of this leader existed when it began."""
         pending = {name: rc.pending for name, rc in self._rcs.items() if rc.pending is not None}
         settled = bool(pending)
         for name in list(pending):
@@ -651,8 +623,8 @@ class Roster:
             self._out.then.append(Resume())
 
     def _is_disputed(self, state: RcState) -> bool:
-        """Return True if the core has another hold, reported by other RCs, for an ARC that this RC reports, and the
-        client has not answered: any node may report holds that do not exist."""
+        """Return True if the core has another hold, by other RCs, for a reported ARC, and the client has not answered:
+        any node may report holds that do not exist."""
         for holder in state.holders:
             known = self._known(arc_id(holder.client, holder.id))
             if known is not None and not known.vouched and known.hold is not None and known.hold.grant != holder.grant:
@@ -714,8 +686,7 @@ class Roster:
                 self._out.then.append(Name(state.rc))
 
     def _follow_begin(self, rc: _Rc, state: RcState) -> None:
-        """Set the deadline by which an RC must begin for each new holder: the longest time that it reports for that, a
-        hold lease and its `settle`."""
+        """Set the deadline of each new holder's begin: the RC's own bound, a hold lease and its `settle`."""
         lease, held = self._timing.hold_lease, {holder.grant for holder in state.holders}
         waits = {holder.grant: holder.waits for holder in state.holders if holder.waits is not None}
         if (rc.waiting - waits.keys()) & held:
@@ -740,14 +711,12 @@ class Roster:
         if rc.joined is not None and overdue is not None and rc.joined.health == overdue[1]:
             self._take_report(rc, replace(rc.joined, health="ok"))
 
-    # Helpers
-
     def _take_outbox(self) -> Outbox:
         out, self._out = self._out, Outbox()
         return out
 
     def _lose_shunned(self, token: Token) -> None:
-        """No leader of the term that a shunned RC shows has appeared: the RC is lost."""
+        """No leader of its term has appeared: the RC is lost."""
         rc = self._rcs[token.name]
         if rc.pending is not None and rc.pending.state.instance == token.instance:
             rc.pending = None
@@ -773,8 +742,7 @@ class Roster:
         self._out.questions.append(Question(purpose, key, self._timing.rebuild / SECOND, **how))
 
     def _set_again(self, question: Question, problem: Problem | None) -> None:
-        """Ask again after `rebuild`. An RC or client that refused this term as absurd is asked to go above its own
-        term."""
+        """Ask again after `rebuild`, above its own term if the RC or client refused this term as absurd."""
         refused = None if problem is None else problem.term
         above = self.sight.me if refused is not None and disbelieved(self.term, refused) else None
         self._set(self._timing.rebuild, _Due.ASK_AGAIN, question._replace(message=RcAsk(above=above)))
@@ -813,7 +781,6 @@ _UNKNOWN: Final = _Rc()
 
 
 def _is_of(message: Any, token: Token) -> bool:
-    """Return True if `message` is the state of this token's instance."""
     return isinstance(message, RcState) and (message.rc, message.instance) == (token.name, token.instance)
 
 
@@ -833,9 +800,8 @@ def discrepancies(
     state: RcState, holders: Iterable[ArcStatus], now: Ns, *, current: bool
 ) -> tuple[tuple[ArcId, ...], bool]:
     """Compare the holds that an RC reports with its `holders` in the core. Return the ARCs whose holds it has ended,
-    and True if it has holds that it should not have.
-
-    `current`: the RC has received all publications about it, so that a hold missing from its report is lost."""
+    and True if it has holds that it should not have. `current`: it has received all publications about it, so that a
+    hold missing from its report is lost."""
     known = {arc.hold.grant: arc for arc in holders if arc.hold is not None}
     held = {holder.grant for holder in state.holders}
     unknown = not held <= known.keys()

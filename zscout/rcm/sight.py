@@ -43,7 +43,6 @@ class Sight:
         return length > self._span and now - ended < self.lease
 
     def is_away(self, now: Ns) -> bool:
-        """Return True while this leader may be away, so that tokens that disappear may still exist."""
         return now < self._away_until
 
     def token_lost(self, now: Ns, host: HostName) -> bool:
@@ -57,7 +56,6 @@ class Sight:
         return self.is_away(now)
 
     def doubt(self, now: Ns) -> None:
-        """For a lease this leader may be away."""
         self._away_until = now + self.lease
 
     def host_answered(self) -> bool:

@@ -114,11 +114,7 @@ class StateView:
         return views
 
 
-# The core's values as messages
-
-
 def _of(arc: ArcStatus) -> dict[str, Any]:
-    """The fields of an ARC that all messages have."""
     return {
         "id": request_id(arc.id),
         "arc": arc.name,
@@ -132,7 +128,6 @@ def _of(arc: ArcStatus) -> dict[str, Any]:
 
 
 def _held(arc: ArcStatus, hold: Hold, now: Ns) -> dict[str, Any]:
-    """The fields of a hold that all messages have."""
     return {
         **_of(arc),
         "grant": hold.grant,

@@ -55,8 +55,8 @@ class Keep(NamedTuple):
 
 
 class Question(NamedTuple):
-    """A question to the mesh. The first answer, or none within `timeout` seconds, becomes a `QuestionAnswered`. Without
-    `kind` it asks for the tokens on `key`, which become a `TokensFound`."""
+    """A question to the mesh; its first answer, or none in `timeout` seconds, becomes a `QuestionAnswered`. Without
+    `kind` it asks for the tokens on `key`, for a `TokensFound`."""
 
     purpose: Purpose
     key: str
@@ -80,8 +80,6 @@ class Purpose(Enum):
 
 
 class OperationAsked(NamedTuple):
-    """An operation on requests."""
-
     ticket: Ticket
     sender: Sender
     operation: Operation
@@ -101,8 +99,6 @@ class TokenSeen(NamedTuple):
 
 
 class Reported(NamedTuple):
-    """An RC published its state."""
-
     state: RcState
 
 
@@ -115,8 +111,6 @@ class QuestionAnswered(NamedTuple):
 
 
 class TokensFound(NamedTuple):
-    """The tokens on a question's key."""
-
     question: Question
     tokens: Sequence[Token]
 
@@ -246,8 +240,8 @@ class Proposed(NamedTuple):
 
 
 class Outbox(Struct):
-    """The results of a step. The shell carries out the fields in their order and awaits nothing in between. Each part
-    of the leader returns an Outbox of its own, with events for the core and stimuli for the next instants."""
+    """The results of a step, carried out in the order of the fields, without awaiting in between. Each part of the
+    leader returns one, with events for the core and stimuli for the next instants."""
 
     at_once: list[Answer] = []
     """Answers that need no decision: refusals, and states of requests before the instant."""
@@ -294,7 +288,6 @@ class Outbox(Struct):
     """False for the parts of an instant with its first answers and its publication."""
 
     def take(self, names: Iterable[str]) -> Outbox:
-        """Move these fields into an Outbox of their own."""
         part = Outbox(last=False)
         for name in names:
             setattr(part, name, getattr(self, name))

@@ -115,8 +115,8 @@ class Terms:
         return not self.secured or (source is not Source.CLIENT and term > self._led)
 
     def _doubted(self, word: Word, now: Ns) -> Ns:
-        """Note the term that an RC shows. Return the time until which its host is not believed; 0: this time it is
-        believed, or other hosts show the term as well."""
+        """Note the term that an RC shows. Return when its host is believed again; 0: now, or other hosts show it
+        too."""
         term, host = word.term, word.host
         if term <= self._led or term in self._tried:
             return 0

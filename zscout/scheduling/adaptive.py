@@ -72,7 +72,7 @@ class _Search:
     steps: int = 0
     slices: int = 0
     rounds: int = 0
-    last_proposals: list[tuple[Rc, HolderSet]] | None = None  # the last round of proposals
+    last_proposals: list[tuple[Rc, HolderSet]] | None = None
 
     @property
     def exhausted(self) -> bool:
@@ -92,8 +92,6 @@ class _Search:
 
 
 class Adaptive(Strategy):
-    """Keeps unfinished searches, so each core has its own."""
-
     name: StrategyName = "adaptive"
 
     def __init__(self) -> None:
@@ -106,7 +104,6 @@ class Adaptive(Strategy):
         self._seen: tuple[int, ...] = ()  # the `_situation` of the unfinished searches
 
     def log_line(self) -> str:
-        """Report where a search has beaten the heuristic, and at what cost."""
         line, self._log_line = self._log_line, ""
         return line
 
@@ -141,7 +138,6 @@ class Adaptive(Strategy):
         return reserved
 
     def _nothing_new(self, state: SchedulerState) -> bool:
-        """Return True if a whole pass would change nothing."""
         index, votes = state.index, state.votes
         changed = index.freed or index.touched or votes.answered or votes.invalidated or votes.due(state.now)
         return not changed and self._seen == _situation(state)

@@ -90,7 +90,7 @@ class AdmissionCheck:
         held = [(rc, holder, "") for rc, holder in self.non_preemptible if rc.name not in bound]
         known = union(rc.bit for rc, _, _ in held)
         for rc, _ in self.non_preemptible:
-            if rc.bit & known:  # two patterns may have the same choices
+            if rc.bit & known:
                 continue
             need = bound[rc.name]
             # `fg/*` and `fg/*#2` have the same choices: keep the unmet patterns of such a group.
@@ -223,10 +223,8 @@ def judge_bindings(
     *,
     presume: bool = False,
 ) -> Verdict | None:
-    """Bind an ARC with patterns, and return the verdict on this binding; None: there is no binding.
-
-    Tries `planned`, then the best bindings, until the ARC may start or only votes keep it out. If none does, it keeps
-    the first."""
+    """Bind an ARC with patterns, `planned` first, then the best bindings, until it may start or only votes keep it out;
+    else by the first. Return the verdict on this binding; None: there is no binding."""
     without, found = 0, choices(state, arc, reserved)
     best: tuple[Mapping[Need, RcName], Verdict] | None = None
     for _ in range(MAX_BINDINGS):

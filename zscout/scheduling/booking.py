@@ -55,11 +55,9 @@ class Booking(Struct, frozen=True):
 
     @property
     def hosts(self) -> set[HostName]:
-        """The hosts that maintenance names."""
         return {host for host in map(host_in, self.needs) if host is not None} if self.maintenance else set()
 
     def maintains(self, rc: RcName, host: HostName) -> bool:
-        """Return True if this maintenance covers the RC, offered by this host."""
         return any(
             need == rc or (matcher(need)(rc) if is_pattern(need) else host_in(need) == host != "")
             for need in self.needs

@@ -105,8 +105,7 @@ class Calendar:
         self.certain_from: Ns = 0  # dates before this are uncertain: no booking begins or expires for good
 
     def stand_in(self, booking: Booking) -> Arc:
-        """Return an ARC that represents a booking until it is taken up. For maintenance it has no RCs: the claim has
-        them."""
+        """An ARC for a booking that is not taken up; without RCs for maintenance, whose claim has them."""
         if booking.maintenance:
             return Arc(request_for(booking), Place(NO_TERM, 0), 0)
         arc = self._state.new_arc(request_for(booking), Place(NO_TERM, 0))
@@ -159,8 +158,7 @@ class Calendar:
         self._offer(claim)
 
     def _kept(self, claim: Claim) -> int:
-        """Bits of the RCs to keep for a claim that is not held. Maintenance of patterns and hosts has the RCs known
-        now."""
+        """Bits of the RCs to keep for a claim not held; for maintenance of patterns and hosts, the RCs known now."""
         booking, state = claim.booking, self._state
         if not booking.maintenance:
             return claim.arc.mask
@@ -188,8 +186,7 @@ class Calendar:
             self._end(claim, BookingState.UNBOOKED, at_present=at_present)
 
     def redate(self, booking: str, start: Ns, *, alike: bool = False) -> None:
-        """Move a booking's date. While it is held only the date changes, not its `booking`. No date is judged again if
-        all move `alike`."""
+        """Move a booking's date; of a held one, not its `booking`. If all move `alike`, no date is judged again."""
         if not alike:
             self._judge_again((booking,))
         if (conflicting := self._in_conflict.get(booking)) is not None:
@@ -217,8 +214,7 @@ class Calendar:
                 self._wait_again(arc, arc.request.not_before)
 
     def take_up(self, booking: str, arc: Arc) -> None:
-        """Let a waiting or running ARC take up its booking: now, or once the booking exists and is open. A waiting ARC
-        is held back until the date."""
+        """Let an ARC take up its booking, now or once that is open. A waiting ARC is held back until the date."""
         claim = self._state.claims.get(booking)
         if not booking or (claim is not None and (claim.booking.maintenance or claim is arc.claim)):
             return
@@ -306,7 +302,6 @@ class Calendar:
             self._state.votes.forget_arc(rc.name, claim.booking.id)
 
     def expire(self) -> None:
-        """End the bookings whose time or patience is over."""
         for claim in self._state.dates.over(self._state.now):
             if claim.booking.end <= self._state.now:
                 used = claim.is_taken or claim.booking.maintenance
@@ -362,7 +357,6 @@ class Calendar:
     # Changes, followed up in parts
 
     def begin(self) -> None:
-        """Begin an instant, with all its checks left."""
         self._checks_left = MAX_CHECKS
 
     def follow_up(self) -> None:
@@ -410,7 +404,6 @@ class Calendar:
                     )
 
     def _judge_again(self, names: Iterable[str]) -> None:
-        """Put these dates in the order to be judged."""
         for name in names:
             if name not in self._unjudged and (rank := self._ranks.get(name)) is not None:
                 self._unjudged.add(name)
@@ -449,7 +442,6 @@ class Calendar:
         return self._state.claims.get(holder) or self._in_conflict.get(holder)
 
     def placeholder_in_conflict(self, holder: ArcId) -> Arc | None:
-        """The ARC that represents a date in conflict in votes."""
         return self._in_conflict[holder].arc if holder in self._in_conflict else None
 
     # Which dates are kept
@@ -492,7 +484,6 @@ class Calendar:
             self._bind(claim, by or "")
 
     def _enter(self, claim: Claim) -> None:
-        """Make a date in conflict a claim again."""
         claim.booking = replace(claim.booking, start=claim.date)
         claim.arc = self.stand_in(claim.booking)
         claim.kept, claim.tentative = self._kept(claim), False
@@ -576,8 +567,7 @@ class Calendar:
         return None, unknown
 
     def _refused(self, rc: Rc, claim: Claim, before: list[Claim], unknown: list[tuple[Rc, HolderSet]]) -> bool:
-        """Return True if the RC refuses the claim beside those `before` it, at any time of the claim. Adds the unknown
-        votes on this."""
+        """Return True if the RC ever refuses the claim beside those `before` it. Adds unknown votes to `unknown`."""
         for time in sorted({claim.booking.start, *(other.booking.start for other in before)}):
             if not claim.booking.start <= time < claim.booking.end:
                 continue

@@ -9,9 +9,8 @@ from zscout.types import ArcId, Params
 
 
 def excess(capacity: Mapping[str, Fraction], holders: Iterable[tuple[ArcId, Params]]) -> str:
-    """Explain why an RC of this capacity can't carry these holders; empty if it can.
-
-    A parameter without a capacity is unbounded, a missing parameter counts 0; sums are exact."""
+    """Explain why an RC of this capacity can't carry these holders; empty if it can. A parameter without a capacity is
+    unbounded, a missing parameter counts 0; sums are exact."""
     totals: dict[str, Fraction] = {}
     for _, params in holders:
         for parameter, value in params.items():

@@ -33,9 +33,8 @@ def undecided_arcs(
     state: SchedulerState, reserved: Reservations | None = None, limit: int | None = None, plan: BindingPlan = NO_PLAN
 ) -> tuple[list[Arc], int] | None:
     """The queued ARCs that might start, best-ranked first, then the running ARCs that might end; and bits of the RCs of
-    ARCs that wait for a vote on a reservation. None: more than `limit` could start.
-
-    ARCs are bound as planned, the others to the remaining RCs as far as possible."""
+    ARCs that wait for a vote on a reservation. None: more than `limit` could start. ARCs are bound as planned, the
+    others to the remaining RCs as far as possible."""
     if state.by_pattern:
         bind_all(state, reserved, plan.mask)
     search = _Search(state, reserved, plan)
@@ -50,7 +49,7 @@ class _Search:
         self._heap: list[
             tuple[Rank, int, Arc, Watched | None]
         ] = []  # candidates, each by itself or as a watcher of an RC
-        self._walked: set[Watched] = set()  # RCs and classes with a watcher in the heap
+        self._walked: set[Watched] = set()
         self._started: Counter[str] = Counter()  # by owner with a quota: ARCs that might start
         self._taken: Counter[str] = Counter()  # by owner with a quota: RCs of these ARCs
         self.awaiting_votes = 0  # bits of the RCs of ARCs that wait for a vote on a reservation
@@ -146,9 +145,8 @@ class _Search:
 def conflict_groups(
     state: SchedulerState, reserved: Reservations | None = None, limit: int | None = None, plan: BindingPlan = NO_PLAN
 ) -> list[ConflictGroup]:
-    """The groups with a choice, best-ranked first; none if more than `limit` ARCs could start.
-
-    One ARC, or one queued ARC without sharable RCs in its group, leaves no choice: `priority` starts it."""
+    """The groups with a choice, best-ranked first; none if more than `limit` ARCs could start. A single ARC, or a
+    single queued ARC without sharable RCs, leaves no choice: `priority` starts it."""
     arcs, awaiting_votes = undecided_arcs(state, reserved, limit, plan) or ((), 0)
     return [
         ConflictGroup(state, members, reserved, plan, awaiting_votes)
@@ -169,10 +167,9 @@ def take_all(
     decided: Sequence[tuple[ConflictGroup, Decision]],
     actions: Actions,
 ) -> tuple[int, BindingPlan]:
-    """Take these sets. Return the bits that are off limits to the following pass of `priority`, and its plan.
-
-    If that pass would end a hold granted at this instant, or might after a veto, the groups with such an ARC are left
-    to it, or all groups if none has one."""
+    """Take these sets. Return the bits off limits to the following pass of `priority`, and its plan. A group is left to
+    that pass if the pass would end a hold granted at this instant to an ARC of the group, or might after a veto; all
+    groups are, if no group has such an ARC."""
     held = union(group.off_limits for group, chosen in decided if chosen == "open")
     taken = [(group, chosen) for group, chosen in decided if isinstance(chosen, int)]
     while taken and plan is not NO_PLAN:
@@ -339,7 +336,6 @@ class ConflictGroup:
         return starting, ending
 
     def take(self, chosen: int, actions: Actions, plan: BindingPlan) -> None:
-        """Preempt the running ARCs outside the set, start the queued ARCs in it."""
         starting, ending = self.changes(chosen)
         for arc in starting:
             if arc.patterns:
@@ -388,8 +384,8 @@ class ConflictGroup:
         return sum(1 << self._number[arc] for arc in holders if arc in self._number)
 
     def _taker(self, victim: Arc, starting: list[Arc]) -> Arc:
-        """The ARC that takes the hold: the best-ranked newcomer that needs one of its exclusive RCs, else of its
-        sharable RCs, else of all."""
+        """The ARC that takes the hold: the best newcomer that needs one of its exclusive RCs, else sharable ones, else
+        any."""
         entitled = [arc for arc in starting if victim.preemptible_by(arc, self.state.now)] or starting
         exclusive = ~self.state.sharable
         for mask in (victim.mask & exclusive, victim.mask):

@@ -94,7 +94,7 @@ class Core:
         return bool(self._state.index.unreported)
 
     def report_reasons(self) -> list[model.Effect]:
-        """Return the reasons that changed since the last report, for callers that display them."""
+        """Return the reasons that changed since the last report."""
         self._effects = []
         for arc, reason in reasons_of_now(self._state):
             self.wait(arc, reason)
@@ -107,7 +107,6 @@ class Core:
         return bool(contended and (reported or state.queued or state.claims))
 
     def contended_holds(self) -> list[ArcId]:
-        """The holds whose upcoming ends may have changed since the last call."""
         return [arc.id for arc in contended_holds(self._state)]
 
     def upcoming(self, arc_id: ArcId) -> tuple[UpcomingEnd, ...]:
@@ -278,7 +277,6 @@ class Core:
 
     @property
     def patience(self) -> Ns:
-        """The patience of an ARC that is queued now; 0 where none is ever due."""
         return self._state.patience if self._state.adaptive else 0
 
     def charged_in_all(self) -> dict[str, float]:
@@ -527,7 +525,6 @@ class Core:
             self._effects.append(self._granted(arc, arc.hold))
 
     def _remove(self, arc: Arc) -> None:
-        """Remove a queued ARC that another replaces."""
         self._state.dequeue(arc)
         self._forget(arc)
         self._calendar.leave(arc)
@@ -661,8 +658,8 @@ class Core:
         self._run_again = True
 
     def _end_hold(self, arc: Arc, outcome: Outcome, reason: Reason, *, requeue: bool = True) -> None:
-        """End a hold. Its ARC is not queued again if it is past its minimum runtime, or names an RC that its owner may
-        not hold now."""
+        """End a hold. Its ARC is not queued again past its minimum runtime, or with an RC that its owner may not
+        hold."""
         requeue = requeue and not arc.past_min_runtime(self._state.now) and not self._state.is_barred(arc)
         hold = self._state.stop(arc)
         self._effects.append(self._revocation(arc, hold, outcome, reason, requeued=requeue))
@@ -683,7 +680,6 @@ class Core:
             self._votes.forget_arc(rc.name, arc.id)
 
     def number(self) -> int:
-        """The next number of this term, for grants and all other publications."""
         self.seq += 1
         return self.seq
 
@@ -701,14 +697,13 @@ class Core:
         return model.HoldEnded(arc.id, arc.request.client, hold.grant, rcs, outcome, reason, requeued, by)
 
     def next_change(self) -> Ns | None:
-        """When time alone next changes something, apart from the order of fair shares; before, only events do."""
+        """When the state next changes by time alone, as when a hold ends; the order of fair shares aside."""
         calendar, held_back = self._calendar, self._state.held_back.values()
         dates = (self._state.next_end(), self._state.dates.next_change(), calendar.next_start, calendar.next_question)
         ends = [end for end in (*dates, self._state.next_starving()) if end is not None]
         return min(ends + [arc.held_back[0] for arc in held_back if arc.held_back], default=None)
 
     def next_order(self) -> Ns | None:
-        """When the waiting groups are next put in order (`fair_shares.py`)."""
         shares = self._state.shares
         return None if shares is None or not self._state.queued else shares.next_order()
 

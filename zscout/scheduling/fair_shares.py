@@ -100,7 +100,6 @@ class Shares:
             self._settle(self._account(group), self._state.now).charged += had
 
     def count_waiting(self, arc: Arc, by: int) -> None:
-        """Count a queued ARC in (1) or out (-1)."""
         group = self.group(arc)
         account = self._queued.get(group)
         if account is None:

@@ -68,7 +68,7 @@ def forecast(
     joined, lead = core.as_events(Term(core.term.counter + 1, "forecast"), MAX_WAITING, without=later)
     result = Forecast()
     ends = {held.request.arc: held.end for held in lead.recovered_holds}
-    releases: dict[ArcId, Ns] = {}  # likely times of release
+    releases: dict[ArcId, Ns] = {}
     requests = [held.request for held in lead.recovered_holds] + [queued.request for queued in lead.waiting]
     requests += [newcomer] if newcomer is not None else []
     runtimes_of = [request.min_runtime for request in requests] + [
@@ -147,11 +147,9 @@ def forecast(
 
 
 class _ComingBookings:
-    """Open bookings that the copy does not know yet. It gets them as they come near, so that a forecast of hours need
-    not copy the bookings of a year.
-
-    Every ARC that starts now ends within `reach`, the longest runtime. Reservations that an unknown booking would move
-    begin later, so they hold back none of these ARCs."""
+    """Open bookings that the copy does not know yet: it gets them as they come near, so a forecast of hours need not
+    copy the bookings of a year. Every ARC that starts now ends within `reach`, the longest runtime. Reservations that
+    an unknown booking would move begin later, so they hold back none of these ARCs."""
 
     def __init__(self, bookings: Iterable[Booking], reach: Ns) -> None:
         self._left = deque(sorted(bookings, key=lambda booking: (booking.start, booking.id)))
@@ -159,7 +157,6 @@ class _ComingBookings:
         self._known_until: Ns = 0
 
     def until(self, now: Ns) -> list[Event]:
-        """The events for the bookings that the copy must know from now on."""
         if now + 2 * self._reach > self._known_until:
             self._known_until = now + LOOKAHEAD * self._reach
         near = list[Event]()

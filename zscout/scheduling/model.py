@@ -79,7 +79,6 @@ class ArcRequest(Struct, frozen=True):
     its RCs (`Core.start`). Rank, patience and reservations go by `min_runtime`."""
 
     def at_most(self, longest: Ns) -> ArcRequest:
-        """Return the request with its runtimes cut to `longest` ns."""
         if max(self.min_runtime, self.until_done) <= longest:
             return self
         shorter = min(self.min_runtime, longest), min(self.until_done, longest)
@@ -196,7 +195,7 @@ class Arc:
     position: int = 0  # the position of its group (`fair_shares.py`); while it runs, as of its start
     vouched: bool = True  # False: only RCs have reported it, not yet its client, and it is not charged
     late: Ns = 0  # delay that its group's share adds to its waiting time (`reservations.py`)
-    owner: str = field(init=False)  # for quotas
+    owner: str = field(init=False)
     id: ArcId = field(init=False)
     priority: int = field(init=False)
     rank: Rank = field(init=False)  # after a takeover two clients may claim one place: the id keeps the order total
@@ -239,8 +238,7 @@ class Arc:
         return self.ends_after(start, start + self.begin_within)
 
     def ends_after(self, start: Ns, begun: Ns, runtime: Ns | None = None) -> Ns:
-        """The end of its minimum runtime, or of its booking, if it is granted at `start` and its devices begin at
-        `begun`. `runtime`: the hold's minimum runtime, if not the request's."""
+        """As `ends`, if its devices begin at `begun`. `runtime`: the hold's minimum runtime, if not the request's."""
         end = begun + (self.request.min_runtime if runtime is None else runtime)
         return end if self.claim is None or start >= self.claim.booking.end else self.claim.booking.end
 
@@ -310,7 +308,6 @@ class Claim:
 
     @property
     def mask(self) -> int:
-        """Bits of the RCs held by it or kept for it."""
         return self.kept if self.arc.hold is None else self.arc.mask
 
 

@@ -7,8 +7,7 @@ from zscout.types import Need, Ns, Params
 
 
 def check_request(name: str, needs: Mapping[Need, Params], min_runtime: Ns) -> None:
-    """Raises ValueError if needs are empty, the minimum runtime is not positive or a parameter is negative, and as
-    `check_patterns`."""
+    """Raises ValueError for empty needs, a minimum runtime <= 0 or a negative parameter, and as `check_patterns`."""
     if not needs:
         raise ValueError(f"{name} needs nothing; name at least one device")
     if min_runtime <= 0:

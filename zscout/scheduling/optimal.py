@@ -62,7 +62,7 @@ def improve(problem: PackingProblem, start: int, budget: float = SOLVER_BUDGET) 
 
 class _Solver:
     def __init__(self, problem: PackingProblem, start: int, budget: float) -> None:
-        from ortools.sat.python import cp_model  # large, so imported on use
+        from ortools.sat.python import cp_model
 
         self.problem, self.found, self.left = problem, start, budget
         self.cp = cp_model
@@ -129,8 +129,7 @@ class _Solver:
             self.model.add_bool_or(~self.takes[number] for number in numbers(nogood))
 
     def _keep_running(self) -> None:
-        """Keep each running item, unless a chosen item that outranks it needs its RCs, or a veto rules it out beside
-        chosen items that all outrank it."""
+        """Keep each running item unless chosen items that outrank it take its RCs or, by a veto, rule it out."""
         problem = self.problem
         for running in problem.running:
             mask = problem.masks[running]
@@ -179,7 +178,6 @@ def decide(group: ConflictGroup, actions: Actions) -> Decision:
 
 
 def best(problem: PackingProblem) -> int:
-    """The best set, or the best within the budget: at least as good as the heuristic's."""
     size = len(problem.items)
     packing = pack(problem, PACKING_WORK // max(1, size) if size <= MAX_PACKED else 0)
     if packing.exact:

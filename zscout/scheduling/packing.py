@@ -18,9 +18,8 @@ NO_LIMIT = 1 << 60
 
 
 class PackingItem(NamedTuple):
-    """An ARC: `mask` of its exclusive RCs, `width` in RCs of both kinds, level (0 is the highest).
-
-    `past_min_runtime`: worth nothing, and may have to end for its own level too, but for no lower level."""
+    """An ARC: `mask` of its exclusive RCs, `width` in RCs of both kinds, level (0 is the highest). `past_min_runtime`:
+    worth nothing, and may have to end for its own level too, but for no lower level."""
 
     mask: int
     width: int
@@ -45,9 +44,8 @@ class Packing:
 
 
 class PackingProblem:
-    """Items in rank order, so levels never decrease; `nogoods`: item sets that must not be chosen together.
-
-    All running items fit together, except as vetoed."""
+    """Items in rank order, so levels never decrease; `nogoods`: item sets that must not be chosen together. All running
+    items fit together, except as vetoed."""
 
     def __init__(self, items: Sequence[PackingItem], nogoods: Iterable[int] = ()) -> None:
         self.items = items
@@ -106,8 +104,8 @@ class PackingProblem:
         return self.value(chosen), -sum(item.in_min_runtime for item in left_out)
 
     def complete(self, preferred: int = 0) -> int:
-        """A maximal feasible set: level by level the running items, the `preferred`, then the rest by rank. Without
-        `preferred` it is the heuristic's set."""
+        """A maximal feasible set by level: running, `preferred`, then other items. Without `preferred`: the
+        heuristic's."""
         items, masks = self.items, self.masks
 
         def order(number: int) -> tuple[int, int]:
@@ -219,7 +217,6 @@ class _BranchAndBound:
 
 
 def numbers(bits: int) -> Iterator[int]:
-    """The numbers in a bit set, smallest first."""
     while bits:
         low = bits & -bits
         yield low.bit_length() - 1

@@ -30,7 +30,6 @@ class RuntimeMean:
         self._next: Ns = 0  # the time of the next update
 
     def count(self, owner: str, min_runtime: Ns) -> None:
-        """Count a grant."""
         grants, mean = self._owners.pop(owner, (0, 0.0))
         grants = min(grants + 1, GRANTS_PER_OWNER)
         self._owners[owner] = grants, mean + (min(min_runtime, MAX_COUNTED_RUNTIME) - mean) / grants

@@ -158,7 +158,7 @@ def class_of(arc: Arc) -> PatternClass:
 
 
 def bind(state: SchedulerState, arc: Arc, reserved: Reservations | None) -> bool:
-    """Bind a queued ARC to its best RCs. Return False if no binding exists."""
+    """Return False if no binding exists."""
     bound = choices(state, arc, reserved).best()
     state.bind(arc, bound or {})
     return bound is not None
@@ -186,7 +186,6 @@ def short(state: SchedulerState, arc: Arc) -> bool:
 
 
 def alternatives(state: SchedulerState, arc: Arc) -> int:
-    """Bits of the sharable RCs that may replace a sharable RC bound to its patterns."""
     masks = class_of(arc).masks
     return union(masks[need] & state.sharable for need, rc in arc.bound.items() if state.rc(rc).sharable)
 

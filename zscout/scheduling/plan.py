@@ -151,7 +151,7 @@ class _DryRun:
             heapq.heappush(self._heap, following)
 
     def _is_held(self, on: Watched, arc: Arc) -> bool:
-        """Return True if no watcher from `arc` on can start: its RC or class is held again, and no path frees it."""
+        """Return True if no watcher of `on` from `arc` on can start: `on` is held again, and no path frees it."""
         if isinstance(on, Rc):
             held, reach = not on.sharable and bool(on.non_preemptible_holders(arc, self.state.now)), on.bit
         else:
@@ -159,8 +159,8 @@ class _DryRun:
         return held and not (reach & self._movable and self._has_paths(arc))
 
     def _has_paths(self, arc: Arc) -> bool:
-        """Return False if no path for `arc` can exist: no RC is free and no hold may end for it, or another ARC of its
-        class found none."""
+        """Return False if `arc` can't start by a path: nothing is free or may end for it, or its class has found
+        none."""
         state = self.state
         if arc.like is not None and self._failed.get(arc.like) == state.version:
             return False
@@ -218,7 +218,7 @@ class _DryRun:
         self._leave(arc)
 
     def _drop(self, arcs: Iterable[Arc]) -> None:
-        """These ARCs end, or would after a veto: note the ones granted at this instant."""
+        """Note which of these ending ARCs were granted at this instant."""
         self._dropped |= {arc.id for arc in arcs if arc.hold is not None and arc.hold.start == self.state.now}
 
     def _start(self, arc: Arc) -> None:

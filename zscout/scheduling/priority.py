@@ -77,9 +77,7 @@ def run_pass(
     reserved: Reservations | None = None,
     plan: BindingPlan | None = None,
 ) -> None:
-    """Run a pass over the ARCs that changes affect.
-
-    `off_limits`: bits of RCs that another strategy still decides about. `reserved`: reservations for starving ARCs,
+    """`off_limits`: bits of RCs that another strategy still decides about. `reserved`: reservations for starving ARCs,
     which the paper does not have."""
     plan = dry_run(state, reserved) if plan is None else plan
     for rc, holders in plan.unknown:
@@ -112,8 +110,6 @@ def _pattern_of(arc: Arc, rc: Rc) -> Need | None:
 
 
 class Pass:
-    """Checks the ready ARCs and the watchers of freed RCs, in rank order."""
-
     def __init__(
         self, state: SchedulerState, actions: Actions, reserved: Reservations | None = None, plan: BindingPlan = NO_PLAN
     ) -> None:
@@ -123,7 +119,7 @@ class Pass:
         self.changed = 0  # bits of the RCs changed since the last pass began
         self._heap: list[tuple[Rank, int, Arc, Watched | None]] = []
         """The next ARCs to check, beside the ready ones; each RC and class has one watcher here."""
-        self._walked: set[Watched] = set()  # RCs and classes with a watcher in the heap
+        self._walked: set[Watched] = set()
         self._changed_here = 0  # bits of the RCs changed by this pass
 
     def run(self, ready_arcs: Iterable[Arc], off_limits: int = 0) -> None:

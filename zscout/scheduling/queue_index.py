@@ -66,8 +66,8 @@ class QueueIndex:
         del self._not_starving[:count]
 
     def next_starving(self, now: Ns) -> Ns | None:
-        """When the next ARC begins to starve, if others starve already: their reservations may then move to a later
-        time, and let an ARC pass."""
+        """When the next ARC begins to starve, if others do already: their later reservations may then let an ARC
+        pass."""
         coming = bisect_right(self._not_starving, now, key=itemgetter(0))
         return self._not_starving[coming][0] if self.starving and coming < len(self._not_starving) else None
 

@@ -128,7 +128,6 @@ class Reason(NamedTuple):
         return self.code in (ReasonCode.CANCELLED, ReasonCode.RELEASED) and not self.detail
 
     def text(self, until: Until | None = None) -> str:
-        """The text; with `until` it includes the ends of others' holds."""
         if self.code is ReasonCode.HELD:
             return _held(self, until)
         if self.code is ReasonCode.VETOED:
@@ -144,8 +143,8 @@ _PREFERRED: Final = (ReasonCode.PREEMPTED, ReasonCode.DISPLACED)
 
 
 def reason_of(why: ReasonInfo | None, label: Callable[[ReasonParty], str] = lambda _: "") -> Reason | None:
-    """The reason in a message, if it names other ARCs, with their `until` in ns from now. None for other reasons: their
-    text is complete. `label`: the text for an ARC, if not its name and person."""
+    """The reason in a message, if it names other ARCs (`until`: ns from now); None: its text is complete. `label`: the
+    text for an ARC, if not its name and person."""
     if why is None or not why.by or not (why.code in _PREFERRED or (why.code in _NAMING and why.rcs)):
         return None
     by = tuple(
@@ -171,8 +170,7 @@ def waits_for_others(why: Reason | ReasonInfo | None) -> bool:
 
 
 def waits(reason: str, why: Reason | ReasonInfo | None) -> str:
-    """The text that follows the name of a waiting ARC: `waits for survey (alice@ws1): robot/a`, `waits: votes are
-    out`."""
+    """The text after the name of a waiting ARC: `waits for survey (alice@ws1): robot/a`, `waits: votes are out`."""
     return reason if waits_for_others(why) else f"waits: {reason}"
 
 
@@ -238,7 +236,6 @@ _COUNTS: Final = dict(enumerate(("one", "two", "three", "four", "five", "six", "
 
 
 def _held(reason: Reason, until: Until | None) -> str:
-    """The text about holders in the way: of the named RCs, then of each pattern's choices."""
     patterns = reason.patterns or ("",) * len(reason.rcs)
     held = list(zip(reason.rcs, reason.by, patterns, strict=False))
     parts = []

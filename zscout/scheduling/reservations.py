@@ -110,7 +110,6 @@ class Reservations:
 
     @property
     def current(self) -> bool:
-        """Return True if nothing that these depend on has changed."""
         return self.made_of == _versions(self._state)
 
     def at(self, rc: Rc, start: Ns, end: float) -> list[Reservation]:
@@ -223,8 +222,8 @@ class Reservations:
         return arc.since + arc.late + arc.patience
 
     def free_until(self, arc: Arc, end: Ns) -> Ns:
-        """The first reserved time of the RCs of `arc` from now on, or `end` if that is earlier. Its own and those of
-        starving ARCs of lower priority don't count."""
+        """When its RCs are next reserved, at most `end`; its own and lower-priority starving ARCs' times don't
+        count."""
         now, band = self._state.now, self._state.band
         for rc in self._state.rcs_in(arc.mask & self.bits):
             for promise in self.at(rc, now, end):
@@ -234,8 +233,8 @@ class Reservations:
         return end
 
     def goes_first(self, arc: Arc) -> bool:
-        """Return True if `arc` precedes its equals: it has taken up a booking or is due, and needs a sharable RC, which
-        may accept each backfilled ARC alone but not all together."""
+        """Return True if `arc` precedes its equals: booked or due, with a sharable RC, which may accept each backfilled
+        ARC alone but not all together."""
         state = self._state
         due = arc.claim is not None or (arc.starving and self.due(arc) <= state.now)
         return due and bool(arc.mask & state.sharable)
@@ -289,9 +288,10 @@ class Reservations:
         return Reservation(arc, claim.booking.start, order_of(self._state, claim.booking), claim.booking.end)
 
     def _together(self, rc: Rc, arc: Arc, before: list[Reservation]) -> list[HolderSet]:
-        """The sets of holders with `arc`, from now until it ends: one per arrival, without the holders that yield to
-        the arriving ARC. A starving ARC may start before its reserved time, but not before ARCs with earlier
-        reservations: when it arrives, these count too, until they are over."""
+        """The sets of holders to ask `rc` about if `arc` starts now: one for now, and one for each promised ARC that
+        arrives before its end. A set has no holder that yields to the arriving ARC. It includes the promised ARCs that
+        may be there: a starving ARC may start before its reserved time, but not before an ARC with an earlier
+        reservation."""
         now, end = self._state.now, arc.ends(self._state.now)
         sets = []
         for time in sorted({now, *(promise.start for promise in before if now < promise.start < end)}):
@@ -332,7 +332,6 @@ class Reservations:
         return binds and arc.ends(now) > reservation.start
 
     def changed(self, earlier: Reservations) -> int:
-        """Bits of the RCs whose reservations have changed since `earlier` was made."""
         booked = self._state.dates.changed_since(earlier.made_of[-1])
         return booked | union(self.starving_changed(earlier))
 

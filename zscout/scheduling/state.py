@@ -33,7 +33,7 @@ class SchedulerState:
         """`adaptive`: preemption has a budget, and shorter ARCs are worth more."""
         self.policy, self.adaptive = policy, adaptive
         self.runtimes = RuntimeMean()
-        self.now: Ns = 0  # the instant of the latest batch of events
+        self.now: Ns = 0
         self.votes = Votes()
         self._ends: list[tuple[Ns, ArcId]] = []
         """A heap of the ends of holds' minimum and longest runtimes. Outdated entries are skipped."""
@@ -100,7 +100,7 @@ class SchedulerState:
         return mask
 
     def bind(self, arc: Arc, bound: Mapping[Need, RcName]) -> None:
-        """Bind the patterns of an ARC that does not run to these RCs: to all or, if `bound` is empty, to none."""
+        """Bind the patterns of an ARC that does not run; if `bound` is empty, unbind them."""
         if arc.bound == bound and arc.rcs:
             return
         wanted, unbound = arc.request.needs, () if bound else arc.patterns
@@ -151,7 +151,7 @@ class SchedulerState:
         return [*self.rcs_in(bits & self.index.watched), *classes]
 
     def next_watcher(self, on: Watched, rank: Rank | None) -> tuple[Rank, int, Arc, Watched] | None:
-        """The best watcher that ranks below `rank` (None: of all), as a heap entry."""
+        """The heap entry of the best watcher of `on` below `rank` (None: of all); None: there is no such watcher."""
         at = 0 if rank is None else bisect_right(on.watchers, rank)
         if at == len(on.watchers):
             return None
@@ -199,16 +199,16 @@ class SchedulerState:
         return self.present & ~self.unwell if self.unwell and not self.operator(priority) else self.present
 
     def closed_to(self, arc: Arc) -> int:
-        """Bits of the RCs of `arc` that are absent, or unwell and not granted to it. An ARC that continues another may
-        have its unwell RCs."""
+        """Bits of its RCs that are absent or, unless it continues an ARC that has them, unwell and not granted to
+        it."""
         closed = arc.mask & ~self.open_to(arc.priority)
         if closed & self.present and (continued := self.continued(arc)) is not None:
             closed &= ~(continued.mask & self.present)
         return closed
 
     def is_free(self, arc: Arc) -> bool:
-        """Return True if a new ARC can start at once: no queue, quota or pattern, and all its RCs exclusive, free and
-        not booked."""
+        """Return True if a new ARC starts at once: no queue, quota or pattern; its RCs are exclusive, free, not
+        booked."""
         if self.queued or self.held_back or arc.patterns or arc.place in self._at_place:
             return False
         if arc.mask & self.dates.claimed:
@@ -217,7 +217,7 @@ class SchedulerState:
         return not bound and not self.closed_to(arc) and not arc.mask & (self.busy | self.sharable)
 
     def enter(self, arc: Arc) -> None:
-        """Add a new ARC that starts at once, without being queued."""
+        """Register a new ARC that starts without being queued."""
         arc.rcs = tuple(self.rcs_in(arc.mask))
         self._register(arc)
         self._at_place[arc.place] = arc
@@ -261,7 +261,7 @@ class SchedulerState:
         insort(like.members, arc.rank)
 
     def class_for(self, arc: Arc) -> PatternClass:
-        """Return the class that an ARC with patterns would be in if it were queued."""
+        """Return the class of an ARC with patterns: the present one, or a new one that is not kept."""
         like = self.classes.get(self._class_key(arc))
         if like is None:
             like = PatternClass()
@@ -329,7 +329,6 @@ class SchedulerState:
         self.leave_place(arc)
 
     def voter(self, arc: ArcId) -> Arc | None:
-        """The ARC, or the booking's placeholder, that has this id in a set of holders."""
         return self.arc(arc) or (self.claims[arc].arc if arc in self.claims else None)
 
     def _register(self, arc: Arc) -> None:
@@ -349,7 +348,6 @@ class SchedulerState:
         return self._owners.get(owner, {}).values()
 
     def hand_over(self, arc: Arc, to: ClientId, renamed: ArcId) -> None:
-        """Move an ARC, with its hold or its place in the queue, to another client and name."""
         if arc.hold is None:
             self.dequeue(arc)
             self._rename(arc, to, renamed)
@@ -398,7 +396,6 @@ class SchedulerState:
         return hold
 
     def retime(self, arc: Arc, hold: Hold) -> None:
-        """Replace the hold of a running ARC by one with another end."""
         before, arc.hold = arc.known_end(), hold
         for end in (hold.end, hold.last):
             if end is not None:
@@ -415,8 +412,7 @@ class SchedulerState:
             self._note_change(rc.bit)
 
     def expired_arcs(self) -> Iterator[Arc]:
-        """Yield the running ARCs whose minimum or longest runtime is over, once each. The caller may end others
-        meanwhile."""
+        """Yield the running ARCs whose minimum or longest runtime is over, once each. The caller may end ARCs."""
         while self._ends and self._ends[0][0] <= self.now:
             at, arc_id = heapq.heappop(self._ends)
             arc = self.running.get(arc_id)
@@ -447,7 +443,6 @@ class SchedulerState:
             self.changed[bit] = max(until, self.changed.get(bit, 0))
 
     def operator(self, priority: int) -> bool:
-        """Return True for an operator's priority."""
         return priority >= self.policy.operator_priority
 
     def band(self, priority: int) -> int:
@@ -563,7 +558,6 @@ class SchedulerState:
         return union(map(self.matching_mask, patterns))
 
     def is_barred(self, arc: Arc) -> bool:
-        """Return True if it names an RC that its owner may not hold now."""
         patterns = self.policy.barred.get(arc.owner, ()) if self.policy.barred else ()
         return any(matcher(pattern)(need) for pattern in patterns for need in arc.request.needs if not is_pattern(need))
 

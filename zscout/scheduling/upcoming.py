@@ -64,7 +64,7 @@ def upcoming(state: SchedulerState, arc: Arc) -> tuple[UpcomingEnd, ...]:
 
 
 def _choose(state: SchedulerState, region: int, holds: list[Arc]) -> None:
-    """Find the holds that the patterns of waiting ARCs will be met by, as far as that is known now."""
+    """Choose the holds that will probably end for the patterns of waiting ARCs (`state.chosen`)."""
     chosen = {name: by for name, by in state.chosen.items() if name in state.running and by in state.queued}
     for hold in holds:
         chosen.pop(hold.id, None)

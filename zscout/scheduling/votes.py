@@ -82,7 +82,7 @@ class RcVotes:
             self._drop(holders, self.vetoed, self._vetoed_at)
 
     def rename(self, arc: ArcId, renamed: ArcId) -> list[int]:
-        """Rename an ARC. Return the numbers of the open proposals that name it."""
+        """Return the numbers of the open proposals that name it."""
         for holders in list(self._accepted_with.get(arc, ())):
             self._drop(holders, self.accepted, self._accepted_with)
             self.accept(_renamed(holders, arc, renamed))
@@ -141,8 +141,8 @@ class Votes:
         return [rc for rc in self.unresponsive if self._by_rc[rc].retry_at <= now]
 
     def propose(self, rc: RcName, holders: HolderSet, now: Ns) -> int | None:
-        """Return the number of a new proposal; None if the same is open or the RC is not due. An unresponsive RC is
-        asked once a quantum."""
+        """Return the number of a new proposal; None if one is open or the RC, if unresponsive, was asked within a
+        quantum."""
         votes = self._by_rc[rc]
         if rc in self.unresponsive:
             if now < votes.retry_at:
@@ -176,7 +176,7 @@ class Votes:
             votes.veto(holders, reason)
 
     def overdue(self, proposal: int, now: Ns) -> None:
-        """Mark the RC unresponsive. The proposal stays open: an answer counts until its query ends."""
+        """Mark the RC unresponsive. An answer still counts until the query ends."""
         if proposal not in self.proposals:
             return
         rc, holders = self.proposals[proposal]
@@ -218,12 +218,10 @@ class Votes:
                 self.proposals[number] = (rc, _renamed(self.proposals[number][1], arc, renamed))
 
     def open(self, rc: RcName) -> int:
-        """The number of sets with an open proposal that is not overdue."""
         votes = self._by_rc[rc]
         return len(votes.proposals) - len(votes.overdue)
 
     def is_asked(self, rc: RcName, holders: HolderSet) -> bool:
-        """Return True if a proposal of this set is open and not overdue."""
         votes = self._by_rc[rc]
         return holders in votes.proposals and holders not in votes.overdue
 
