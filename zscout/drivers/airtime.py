@@ -61,12 +61,11 @@ class Share:
 
 
 def room(rate: Fraction) -> Fraction:
-    """Bytes per second for all holders of a line of `rate` bytes per second."""
     return rate * (1 - RESERVE)
 
 
 def default_rate(rate: Fraction) -> Fraction:
-    """Packets per second on a line of `rate` bytes per second for a holder that requests no `command_rate`."""
+    """Packets per second of a holder that requests no `command_rate`."""
     return min(DEFAULT_RATE, room(rate) / MAX_PACKET)
 
 
@@ -93,8 +92,7 @@ def longest_wait(rate: Fraction, shares: Iterable[Share]) -> Fraction:
 
 
 def objection(rate: Fraction, bound: Fraction, shares: Iterable[Share]) -> str:
-    """The reason why a line of `rate` bytes per second can't carry these shares with waits of at most `bound` seconds;
-    "" if it can."""
+    """Why a line of `rate` bytes per second can't carry these shares with waits of at most `bound` seconds; or ""."""
     shares = list(shares)
     most = room(rate)
     wanted = sum((share.bytes_per_second for share in shares), Fraction(0))
@@ -122,7 +120,7 @@ class Bucket:
         return Fraction(self._full_at - (self.size - needed) * self._period)
 
     def take(self, needed: int, at: Fraction | Ns) -> None:
-        """Remove `needed` tokens at `at`; the bucket may go into debt."""
+        """The bucket may go into debt."""
         self._full_at = max(self._full_at, at) + needed * self._period
 
     def admits(self, needed: int, now: Ns) -> bool:

@@ -54,8 +54,8 @@ _URL = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*://")
 
 @dataclass(frozen=True, slots=True)
 class CapturedFrame:
-    """One picture. `number` counts from 1, also over reopenings of the source. `time`: when it was read, in seconds of
-    this host's clock. `picture`: uint8, (height, width) or (height, width, 3) BGR."""
+    """`number` counts from 1, also over reopenings of the source; `time`: when it was read, in seconds of this host's
+    clock; `picture`: uint8, (height, width) or (height, width, 3) BGR."""
 
     number: int
     time: float
@@ -113,8 +113,7 @@ class Capture:
         _LIVING.add(self)
 
     def stop(self, wait: float = 1.0) -> None:
-        """Stop reading, and wait at most `wait` seconds for the thread. If it is blocked in OpenCV, it ends at the
-        source's timeout."""
+        """Stop, and wait at most `wait` seconds for the thread. In OpenCV it ends only at the source's timeout."""
         self._stop.set()
         with self._new_picture:
             self._new_picture.notify_all()
@@ -126,16 +125,14 @@ class Capture:
         return self._thread.is_alive()
 
     def wait(self, after: int, timeout: float) -> CapturedFrame | None:
-        """Wait for a picture with a number above `after`, and return the newest; None if none came within `timeout`
-        seconds, or if the capture was stopped."""
+        """Return the newest picture, numbered above `after`; None if none came in `timeout` seconds, or once
+        stopped."""
         with self._new_picture:
             self._new_picture.wait_for(lambda: self.number > after or self._stop.is_set(), timeout)
             if self._stop.is_set() or self.number <= after:
                 return None
             self._taken = True
             return self._newest
-
-    # In the thread
 
     def _run(self) -> None:
         pause = PAUSES[0]
@@ -153,7 +150,6 @@ class Capture:
             pause = min(2 * pause, PAUSES[1])
 
     def _read_all(self) -> None:
-        """Open the source, and read it until it fails or ends."""
         began = seconds()
         with _TRANSPORT.of(self._transport, self.source):
             video = _open(self.source, self.kind, self._open_timeout, self._read_timeout)
@@ -216,7 +212,6 @@ class Capture:
             self._new_picture.notify_all()
 
     def _ended(self, video: cv2.VideoCapture, waited: float, *, pictures: int) -> None:
-        """An open source gives no more pictures: set `health`."""
         name = shown(self.source)
         if codec := self.number == 0 and UNDECODABLE.get(_codec(video)):
             self._set_health(f"{name} sends {codec}, which can't be decoded here; {REMEDY}")
@@ -270,8 +265,8 @@ def _stop_all() -> None:
 
 
 class _Transport:
-    """OpenCV reads the transport of RTSP only from the environment, when it opens a source. So sources with the same
-    transport are opened in parallel, and sources with different transports in turn."""
+    """OpenCV reads RTSP's transport from the environment when it opens a source: sources with different transports are
+    opened in turn."""
 
     def __init__(self) -> None:
         self._turn = threading.Lock()
@@ -383,5 +378,4 @@ def _file_period(video: cv2.VideoCapture) -> float:
 
 
 def seconds() -> float:
-    """The time by this host's clock, in seconds."""
     return clock.now() / SECOND

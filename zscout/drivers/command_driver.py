@@ -52,8 +52,6 @@ def _retry_pause(failures: int) -> float:
 
 @dataclass(frozen=True, slots=True)
 class Ended:
-    """How a command ended."""
-
     problem: str
     """Empty on success; otherwise a text with the last line of its output."""
     seconds: float
@@ -236,7 +234,7 @@ class CommandDriver(Driver):
 
 async def run_bounded(words: Words, env: Mapping[str, str], timeout: float, give_way: asyncio.Event) -> Ended:
     """Run a program in a new session for at most `timeout` seconds, or until `give_way` is set. At its end, and when
-    cancelled, kill all processes in its process group."""
+    cancelled, kill all of its process group."""
     began = time.monotonic()
     try:
         reading, writing = os.pipe()
@@ -284,8 +282,6 @@ async def run_bounded(words: Words, env: Mapping[str, str], timeout: float, give
 
 
 class OutputTail:
-    """The end of a command's output."""
-
     def __init__(self, reader: asyncio.StreamReader) -> None:
         self._reader = reader
         self._kept = b""

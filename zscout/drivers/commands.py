@@ -76,7 +76,7 @@ RobotCommand: TypeAlias = RobotDrive | RobotStop | RobotCamera
 
 
 def radio_command(do: Mapping[str, Any]) -> RadioCommand:
-    """Read a command of a radio. Raises Refused."""
+    """Raises Refused."""
     order: RadioCommand = _read(do, RadioCommand, ("drive", "camera", "stop", "halt"))
     if isinstance(order, RadioStop | RadioHalt) and order.rc is not None:
         try:
@@ -87,7 +87,7 @@ def radio_command(do: Mapping[str, Any]) -> RadioCommand:
 
 
 def robot_command(do: Mapping[str, Any]) -> RobotCommand:
-    """Read a command of a robot. Raises Refused."""
+    """Raises Refused."""
     order: RobotCommand = _read(do, RobotCommand, ("drive", "camera", "stop"))
     return order
 

@@ -15,15 +15,13 @@ CommandQuery: TypeAlias = IncomingQuery[Command]
 
 
 class ConfirmServer:
-    """Serves the RCs of this process that accept commands."""
-
     def __init__(self, mesh: Mesh) -> None:
         self._mesh = mesh
         self._rcs: dict[RcName, Callable[[CommandQuery], None]] = {}
         mesh.serve(mesh.keys.confirm_any(mesh.me.host), Confirm, self._on_confirm)
 
     def serve(self, rc: RcName, on_command: Callable[[CommandQuery], None]) -> Declaration:
-        """Confirm grants for `rc` as well: `on_command` handles the query as a command, and may raise Refused."""
+        """`on_command` handles the query as a command, and may raise Refused."""
         self._rcs[rc] = on_command
 
         def leave() -> None:
@@ -47,8 +45,6 @@ class ConfirmServer:
 
 
 class _Answers:
-    """Collects the RCs' answers to a query."""
-
     def __init__(self, query: IncomingQuery[Confirm], missing: int) -> None:
         self._query, self._missing = query, missing
         self._collected = Confirmed()
@@ -66,8 +62,6 @@ class _Answers:
 
 
 class _Part(IncomingQuery[Command]):
-    """The question to a single RC."""
-
     __slots__ = ("_answers", "_rc")
 
     def __init__(self, answers: _Answers, rc: RcName, key: str, command: Command, arrived: Ns) -> None:

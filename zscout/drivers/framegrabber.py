@@ -185,8 +185,8 @@ class FramegrabberDriver(Driver):
                 return await super().command(holder, do)
 
     def figures(self) -> Figures:
-        """Rates are per second, over the last 3 s. Latency is from reading a picture to its publication, the median of
-        the last 64. `dropped`, `opened` and `stalls` count since the node started."""
+        """Rates per second, over the last 3 s; median latency from reading to publication, over the last 64 pictures.
+        `dropped`, `opened` and `stalls` count since the node started."""
         totals, meter = self._totals(), self._meter
         return {
             "frames_per_second": round(meter.rate(seconds()), 1),
@@ -208,8 +208,6 @@ class FramegrabberDriver(Driver):
     def _totals(self) -> Counter[str]:
         own = {name: getattr(self._capture, name, 0) for name in ("number", "dropped", "opened", "stalls")}
         return self._before + Counter(own)
-
-    # Tuning
 
     def _of_gang(self, rcs: list[str]) -> tuple[str | None, str]:
         """Return the source that a gang determines, or None and the reason."""
@@ -236,7 +234,6 @@ class FramegrabberDriver(Driver):
         return to
 
     def _tune(self, source: str, holder: Holder) -> None:
-        """Publish pictures of this source under the grant of `holder`."""
         self._stop_pump()
         self._untuned, self._silent = "", 0.0
         capture = self._capture
@@ -271,8 +268,7 @@ class FramegrabberDriver(Driver):
         self._pump = None
 
     def _close_unless_needed(self) -> None:
-        """Close the source unless the framegrabber is held or unwell, or has subscribers: then the next holder has its
-        picture at once."""
+        """Keep the source while held, unwell or watched: then the next holder has its picture at once."""
         if self._holder is None and not self._publisher.watched and not self._unwell:
             self._let_go()
 
@@ -326,9 +322,8 @@ class FramegrabberDriver(Driver):
 
 
 def pace_of(rate: float) -> Bucket:
-    """A bucket that admits at most `rate` frames a second, to skip frames that come too early. With its tolerance of
-    EARLY intervals a slightly faster or uneven source loses only its surplus (generic cell rate algorithm, ITU-T I.371,
-    annex A)."""
+    """A bucket for at most `rate` frames a second. With its tolerance of EARLY intervals a slightly faster or uneven
+    source loses only its surplus (generic cell rate algorithm, ITU-T I.371, annex A)."""
     return Bucket(1 + EARLY, Fraction(rate), 0)
 
 
@@ -361,9 +356,8 @@ class FrameMeter:
 
 class FramePump:
     """A thread that publishes the new pictures of a capture, until it is stopped. `head`: the common part of all frame
-    heads; frame numbers count from its number. `published` is called for each published frame, in this thread.
-
-    At most `rate` frames a second, with JPEG `quality` 1..100. Without subscribers nothing is even encoded."""
+    heads; frame numbers count from its number. `published` is called in this thread for each frame. At most `rate`
+    frames a second, with JPEG `quality` 1..100. Without subscribers nothing is even encoded."""
 
     def __init__(
         self,
@@ -393,7 +387,7 @@ class FramePump:
             self._stopped = True
 
     def join(self) -> None:
-        """Wait for the end of the thread after `stop`, at most some tenths of a second."""
+        """At most some tenths of a second, after `stop`."""
         self._thread.join()
 
     def _run(self) -> None:

@@ -15,8 +15,6 @@ from zscout.types import SECOND
 
 
 class ExclusiveDriver(Driver):
-    """A device that can only be held."""
-
     Options: ClassVar[type] = ExclusiveRc
 
     def __init__(self, *, activation: float = 0.0) -> None:
@@ -61,8 +59,7 @@ class CapacityDriver(ExclusiveDriver):
 
 
 class VideoDriver(Driver):
-    """A video channel, which is a radio frequency: a single holder may transmit, any number may receive. Bandwidth
-    parameter: `transmitters`, 1 by default; 0 only receives."""
+    """A radio frequency: any number may receive, one may transmit. `transmitters`: 1 by default; 0 only receives."""
 
     Options = VideoRc
     sharable = True

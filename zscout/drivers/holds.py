@@ -64,13 +64,12 @@ class HoldEntry:
         return self.is_timed and now >= self.end and not self.holder.keep
 
     def take(self, holder: Holder, now: Ns) -> None:
-        """Set the published `holder`, when it begins or when its devices have begun."""
         self.holder, self.end = holder, now + round(holder.remaining * SECOND)
         if holder.protected_from is not None:
             self.protected_from = self.end - round(holder.protected_from * SECOND)
 
     def state(self, now: Ns, waits: Ns | None) -> Holder:
-        """Return the holder with its remaining time. `waits`: the longest time until this device begins."""
+        """`waits`: the longest time until this device begins."""
         if self.is_timed:
             return structs.replace(self.holder, remaining=(self.end - now) / SECOND)
         # All of its time is left; its protection does not wait.
@@ -133,7 +132,6 @@ class HoldChange:
 
     @property
     def interrupts(self) -> bool:
-        """Return True if the device has no holder between the removed and the new ones."""
         return not self.stayed and self.over == self.removed
 
 
@@ -151,7 +149,6 @@ def continues_as(before: Holder, after: Holder) -> bool:
 
 
 def _arc(holder: Holder) -> tuple[str, Place]:
-    """The identity of an ARC, which it keeps at another client."""
     return holder.id, holder.place
 
 
@@ -177,19 +174,16 @@ class HoldTable:
         self._awaited: set[Grant] = set()
         """Grants that a snapshot named while another hold was in force: their publication has not arrived."""
 
-    # Publications and snapshots
-
     def follow(self, grants: Grants, now: Ns) -> bool:
-        """Take the next publication of the obeyed RCM if it concerns only other RCs, as most do. Return False if it
-        must be applied."""
+        """Take the next publication if it concerns only other RCs, as most do. Return False if it must be applied."""
         if grants.term != self.term or not grants.prev <= self.seq <= grants.seq or self.rc in grants.rcs:
             return False
         self.seq, self.last_contact = grants.seq, now
         return True
 
     def apply_grants(self, grants: Grants, now: Ns, *, sharable: bool = True, stalled: bool = False) -> HoldChange:
-        """Take a publication. If an exclusive RC has several holders, only the newest grant is obeyed. `stalled`: this
-        process has just stalled, and received nothing meanwhile."""
+        """Take a publication. Of several holders of an exclusive RC only the newest is obeyed. `stalled`: this process
+        has just stalled, and received nothing meanwhile."""
         missed = grants.term != self.term or grants.prev > self.seq
         change = HoldChange()
         if not self._accept(grants, change, now):
@@ -229,10 +223,9 @@ class HoldTable:
     def apply_snapshot(
         self, state: RcmState, now: Ns, carries: Callable[[Collection[Holder]], bool] = lambda _: False
     ) -> HoldChange:
-        """Take a snapshot: add missed holds, and announce holds that it lacks.
-
-        It ends only older holds of the ARCs that it names, so holds in force here may be over. Beside them a new hold
-        begins only if the device `carries` all of them; an exclusive device never does."""
+        """Take a snapshot: add missed holds, and announce holds that it lacks. It ends only older holds of the ARCs
+        that it names, so holds in force here may be over. Beside them a new hold begins only if the device `carries`
+        all of them; an exclusive device never does."""
         change = HoldChange()
         if not self._accept(state, change, now):
             return change
@@ -280,20 +273,17 @@ class HoldTable:
         return now - self.last_contact < self.hold_lease
 
     def catch_up(self, term: Term) -> None:
-        """Other RCs have promised `term`."""
         if term > self.term:
             self.term, self.seq = term, 0
 
     def promise(self, term: Term, now: Ns, *, above: bool = False) -> bool:
         """Promise to obey no lower term again. Return False if a higher term is known, or if the jump is absurd;
-        `above` permits large jumps, because the fleet must get above a term that an RC already obeys."""
+        `above` permits large jumps, to get above a term that an RC already obeys."""
         if term < self.term or absurd(term, self.term, heard=self._in_contact(now) and not above):
             return False
         if term != self.term:
             self.term, self.seq = term, 0
         return True
-
-    # Time
 
     def expire(self, now: Ns, *, lease: bool = True) -> HoldChange:
         """End the holds that are over. Holds that may be kept end only with the lease."""
@@ -309,7 +299,6 @@ class HoldTable:
         return change
 
     def next_expiry(self) -> Ns | None:
-        """When to call `expire` next."""
         ends = [held.end for held in self.held.values() if held.is_timed and not held.holder.keep]
         if self.held:
             ends.append(self.last_contact + self.hold_lease)
@@ -319,8 +308,6 @@ class HoldTable:
         change = HoldChange()
         self._end_all(why, change, now, expired="failed")
         return change
-
-    # Settling
 
     def confirmed(self, grant: Grant, now: Ns) -> None:
         """A client confirmed a hold in force: the program of a direct hold may run from now on."""
@@ -333,7 +320,6 @@ class HoldTable:
         return self._bound(grant, client, now, now + self.settle)
 
     def left(self, grant: Grant, client: str, now: Ns) -> HoldChange | Problem:
-        """The client's program is gone."""
         return self._bound(grant, client, now, now)
 
     def _bound(self, grant: Grant, client: str, now: Ns, gone_by: Ns) -> HoldChange | Problem:
@@ -370,11 +356,9 @@ class HoldTable:
         elif grant in self.held:
             self.held[grant].gone_by = None
 
-    # Commands
-
     def check(self, grant: Grant, client: str, now: Ns) -> Problem | None:
-        """Return why a command of `client` under `grant` is refused now, or None if it is obeyed. Codes are part of the
-        protocol."""
+        """Return why a command of `client` under `grant` is refused now, with a code of the protocol; None: it is
+        obeyed."""
         held = self.held.get(grant)
         newer = (grant.term, grant.seq) > (self.term, self.seq) and not absurd(grant.term, self.term)
         if held is not None and held.holder.client != client:
@@ -395,10 +379,8 @@ class HoldTable:
         return Problem(code, why, self.term)
 
     def holders(self, now: Ns, waits: Mapping[Grant, Ns] = MappingProxyType({})) -> list[Holder]:
-        """The holders with their remaining time. `waits`: by grant, the longest time until the device begins."""
+        """`waits`: by grant, the longest time until the device begins."""
         return [held.state(now, waits.get(grant)) for grant, held in self.held.items()]
-
-    # Beginning
 
     def begun(self, grant: Grant, now: Ns, *, late: bool = False) -> None:
         """The device has begun for a hold in force. `late`: some time after the grant, so its time begins now."""
@@ -409,12 +391,10 @@ class HoldTable:
                 entry.end = now + round(entry.holder.remaining * SECOND)
 
     def _retime(self, holder: Holder, now: Ns) -> None:
-        """The leader published a hold in force again: if its `waits` appeared or ended, take its new times."""
+        """Take new times for a hold in force if its `waits` appeared or ended."""
         entry = self.held[holder.grant]
         if (entry.holder.waits is None) is not (holder.waits is None):
             entry.take(holder, now)
-
-    # Changes
 
     def _begin(self, holder: Holder, change: HoldChange, now: Ns) -> None:
         self._events += 1

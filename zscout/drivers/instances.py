@@ -26,8 +26,8 @@ class InstanceState(enum.Enum):
 
 
 class Instances:
-    """Follows the instances of `rc`; `instance` is the id of its own. `patience`: seconds after which no program can
-    use another instance's device, once that instance is gone."""
+    """Follows the instances of `rc`. `patience`: seconds after which no program can use a vanished instance's
+    device."""
 
     def __init__(
         self,
@@ -67,7 +67,6 @@ class Instances:
             self.take(min(elsewhere).instance)
 
     def take(self, named: str, host: HostName | None = None) -> None:
-        """The obeyed RCM names the instance `named`, at `host` if given."""
         if named == self.instance:
             self._become(InstanceState.SERVES)
         elif (self._others[named].host if named in self._others else host) != self._mesh.me.host:
@@ -79,7 +78,6 @@ class Instances:
             self._become(InstanceState.STANDS_BY)
 
     def _is_at(self, host: HostName | None) -> None:
-        """Note the host of the serving instance."""
         before, self._host = self._host, host
         if self.state is InstanceState.STANDS_BY and before != host:
             log.warning("%s is on standby: duplicate of %s", self._rc, self.duplicate_of)

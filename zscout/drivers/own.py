@@ -36,7 +36,6 @@ class OwnRcHandle(RcHandle, Protocol):
 
 
 def own(rc: RcHandle) -> OwnRcHandle:
-    """Narrow the type of `rc` for a driver that comes with zscout."""
     return cast("OwnRcHandle", rc)
 
 
@@ -67,7 +66,6 @@ class RcDirectory:
         self._on_change()
 
     def hosts(self, rc: str) -> set[str]:
-        """The hosts that offer this RC: a single host, unless two nodes offer the same name."""
         return {token.host for token in self._tokens.get(rc, ())}
 
     def is_node_of_gang(self, sender: Sender, holder: Holder, but: str) -> bool:

@@ -33,8 +33,7 @@ FULL: Final = 127
 
 @dataclass(frozen=True, slots=True)
 class Packet:
-    """Base of all packets. `robot` is 0 to 254. `number` counts a robot's commands modulo 256; the robot obeys packets
-    of the same number once."""
+    """`robot`: 0 to 254. `number` counts its commands modulo 256; the robot obeys packets of one number once."""
 
     operation: ClassVar[int]
     robot: int
@@ -52,9 +51,8 @@ class Packet:
 
 @dataclass(frozen=True, slots=True)
 class DrivePacket(Packet):
-    """Turn the wheels for `lasts` seconds, or until a newer packet.
-
-    `left` and `right` are -1 to 1 of top speed; they are sent in steps of 1/127, `lasts` in 1/50 s."""
+    """Turn the wheels for `lasts` seconds, or until a newer packet. `left` and `right` are -1 to 1 of top speed; they
+    are sent in steps of 1/127, `lasts` in 1/50 s."""
 
     operation: ClassVar[int] = 1
     left: float
@@ -97,7 +95,6 @@ class HaltPacket(Packet):
 
 
 def encode(packet: Packet) -> bytes:
-    """The packet as bytes on the air."""
     arguments = b""
     if isinstance(packet, DrivePacket):
         lasts = max(1, round(packet.lasts * TICKS))
@@ -150,7 +147,6 @@ class PacketDecoder:
 
 
 def _decode(framed: bytes) -> Packet | None:
-    """Decode the bytes after the sync byte; None if they are not a valid packet."""
     if _crc(framed[:-2]) != framed[-2:]:
         return None
     robot, number, operation, *arguments = framed[1:-2]

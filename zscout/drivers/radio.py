@@ -85,8 +85,6 @@ class RadioDriver(Driver):
         await self._supervisor.close()
         await self._line.stop()
 
-    # Holders
-
     def vote(self, holders: list[ProposedHolder]) -> str:
         shares: list[Share] = []
         for holder in holders:
@@ -134,8 +132,6 @@ class RadioDriver(Driver):
         for robot in self._air.leave(place):
             self._send_urgent(RadioHalt(robot))
 
-    # Commands
-
     async def command(self, holder: Holder, do: Mapping[str, Any]) -> Any:
         order = radio_command(do)
         owner = self._robots.get(order.robot)
@@ -177,10 +173,7 @@ class RadioDriver(Driver):
         self._pump()
         return {"after": after / SECOND}
 
-    # Sending packets
-
     def _pump(self) -> None:
-        """Write packets while the line has room, and set a timer for the next."""
         if self._timer is not None:
             self._timer.cancel()
         if self._down:
@@ -203,7 +196,6 @@ class RadioDriver(Driver):
             self._timer = self._supervisor.call_later(delay, self._pump)
 
     def _is_in_force(self, grant: Grant) -> bool:
-        """Return True if the hold of a packet is in force now, when the packet is sent."""
         held, holds = self._rc.holds.held.get(grant), self._rc.holds
         return held is not None and holds.check(grant, held.holder.client, self._rc.now()) is None
 

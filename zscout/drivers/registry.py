@@ -50,7 +50,6 @@ def driver_for(rc: RcConfig) -> Driver:
 
 
 def driver_name(rc: RcConfig) -> str:
-    """The driver's name in the node file."""
     return rc.driver if isinstance(rc, PluginRc) else str(rc.__struct_config__.tag)
 
 

@@ -209,7 +209,7 @@ class ResourceController:
             self.publish()
 
     async def stop(self) -> None:
-        """Leave the mesh and put the device into its safe state. Can be called several times."""
+        """Leave the mesh and make the device safe. May be called several times."""
         if self._stopping is None:
             self._stopping = asyncio.get_running_loop().create_task(self._stop())
         await asyncio.shield(self._stopping)
@@ -231,8 +231,6 @@ class ResourceController:
         self._stopping = asyncio.get_running_loop().create_task(self._stop())
         self._on_failure(error)
         self.fail(f"its resource controller failed: {error}")  # this may raise as well
-
-    # RcHandle, for the driver
 
     def now(self) -> Ns:
         return self.mesh.now()
@@ -300,8 +298,6 @@ class ResourceController:
         self._published, self._use.unpublished = self.mesh.now(), False
         self._state.put(self._rc_state(ended or []))
 
-    # Messages of the RCM
-
     def _on_leader(self, token: Token, alive: bool) -> None:
         (self._leaders.add if alive else self._leaders.discard)(token)
         if not alive and self._asked.rcm == token.instance:
@@ -333,7 +329,6 @@ class ResourceController:
             self.supervisor.spawn(self._promise_above(query, query.message.above))
 
     def _on_question(self, query: IncomingQuery[messages.RcAsk]) -> None:
-        """Answer a query from a sender that may not ask for a promise."""
         query.answer(self._rc_state([]))
 
     async def _promise_above(self, query: IncomingQuery[messages.RcAsk], host: str) -> None:
@@ -411,8 +406,6 @@ class ResourceController:
             raise Refused("bad_request", str(error)) from None
         query.answer(messages.Ballot(proposal=proposal.proposal, accept=not reason, reason=reason))
 
-    # Commands
-
     def _on_command(self, query: CommandQuery) -> None:
         sender = self.mesh.keys.sender_of(query.key)  # refuses invalid names
         if not self._memory.is_new(sender, query):
@@ -428,7 +421,6 @@ class ResourceController:
             raise Refused("busy", f"{COMMANDS_PER_HOST} commands of {sender.host} to {self.name} wait; try again")
 
     async def _worker(self) -> None:
-        """Carry out hold changes and commands, one at a time."""
         while True:
             work = await self.queue.get()
             if isinstance(work, HoldChange):
@@ -447,7 +439,6 @@ class ResourceController:
             self._read_state()
 
     async def _carry_out(self, query: CommandQuery) -> Any:
-        """Return the answer, or a Future of it."""
         command = query.message
         sender = self.mesh.keys.sender_of(query.key)
         if self._is_stale(query):
@@ -573,8 +564,6 @@ class ResourceController:
         problem = self._refusal(query)
         return problem is not None and problem.code == "not_yet" and not self._is_stale(query)
 
-    # Holds
-
     async def _carry_out_change(self, change: HoldChange) -> None:
         for holder in change.over:
             if holder.grant in self._at_driver:
@@ -599,8 +588,8 @@ class ResourceController:
             self.supervisor.spawn(self._forget_direct())
 
     async def _begin_held_back(self, *, at_once: Collection[messages.Holder]) -> None:
-        """Begin the holds at the driver that nothing holds back any more. Holds that have ended meanwhile are skipped,
-        and their `end` too."""
+        """Begin the holds at the driver that nothing holds back any more. Ended ones are skipped, and their `end`
+        too."""
         if self._making_safe is not None:
             return
         for grant, holder in list(self._held_back.items()):
@@ -632,7 +621,6 @@ class ResourceController:
         self._note_begun()
 
     def _note_begun(self) -> None:
-        """The device has begun for all holders at the driver: start their time."""
         now, late = self.mesh.now(), self._published_waits & self._entered
         for grant in self._entered & self.holds.held.keys():
             self.holds.begun(grant, now, late=grant in late)
@@ -664,8 +652,7 @@ class ResourceController:
         return waits
 
     async def _make_safe(self) -> None:
-        """Make the device safe. If that takes longer than SAFE_WAIT_S, it runs beside other work, and new holds are
-        held back."""
+        """Make the device safe. After SAFE_WAIT_S this continues beside other work, and new holds are held back."""
         if self._making_safe is not None:
             self._safe_again = True
             return
@@ -800,8 +787,8 @@ class ResourceController:
             await self._check_for_contradictions()
 
     async def _check_for_contradictions(self) -> None:
-        """Suspect the mesh if a leader's token, its publications or its queries are missing while another of them
-        arrives: then declarations did not reach the other side. Also if candidates are seen and none leads in time."""
+        """Suspect the mesh if of a leader's token, publications and queries some are missing while others arrive, as
+        then declarations were lost; or if candidates are seen and none leads in time."""
         silent = bool(self._leaders) and not self._receives
         self.mesh.suspicions.suspect(
             f"{self.name}: an RCM is seen that does not publish", so=silent, patience=SILENT_RCM_PATIENCE

@@ -41,8 +41,6 @@ RECENT: Final = 64
 
 @dataclass(slots=True)
 class _Waiting:
-    """A command that was not yet sent to the radio."""
-
     order: commands.RadioDrive | commands.RadioCamera | commands.RadioStop
     radio: str
     grant: Grant
@@ -59,14 +57,11 @@ class _Waiting:
 
 
 class RobotDriver(Driver):
-    """The RC of a robot. The RC `radio` sends its halts."""
-
     Options = RobotRc
 
     def __init__(self, robot: int, *, radio: str, channels: Mapping[str, int], warm_up: float, dead_man: float) -> None:
         """`robot`: its id on the air. `channels`: of its camera, by video RC. `warm_up`: seconds until the camera
-        works. `dead_man`: seconds after the last drive command until the robot is stopped, even if this command lasts
-        longer."""
+        works. `dead_man`: seconds from a drive command until the robot is stopped, even if the command lasts longer."""
         self.activation = warm_up
         self._id, self._radio, self._channels = robot, radio, dict(channels)
         self._dead_man = dead_man
@@ -114,8 +109,6 @@ class RobotDriver(Driver):
         """Only the camera warms up, and only after a command that switches it on."""
         return True
 
-    # Commands
-
     async def command(self, holder: Holder, do: Mapping[str, Any]) -> Any:
         order = commands.robot_command(do)
         radio = self._radio_of(holder)
@@ -137,7 +130,6 @@ class RobotDriver(Driver):
         return waiting.answer
 
     def _radio_of(self, holder: Holder) -> str:
-        """The radio in the robot's gang: its own, or the only other radio."""
         radios = [rc for rc in holder.rcs if rc.startswith("radio/")]
         if self._radio in radios:
             return self._radio
@@ -147,7 +139,6 @@ class RobotDriver(Driver):
         raise Refused("no_radio", f"your request {holds}, so it can't reach the robot; request {self._radio} as well")
 
     def _channel_of(self, holder: Holder) -> int:
-        """The camera channel of the video RC in the robot's gang."""
         videos = [rc for rc in holder.rcs if rc.startswith("video/")]
         if not videos:
             raise Refused("no_video", "your request holds no video channel to transmit on; request video/* as well")
@@ -161,7 +152,6 @@ class RobotDriver(Driver):
         return channel
 
     async def _send_all(self) -> None:
-        """Send the waiting commands to the radio, in order."""
         while True:
             await self._queued.wait()
             self._queued.clear()
@@ -193,12 +183,9 @@ class RobotDriver(Driver):
         return await self._mesh.ask_one(key, message, Done, timeout=timeout)
 
     def _drop(self, outcome: Any, kind: type = object) -> None:
-        """Remove the waiting commands of this kind, and answer them with `outcome`."""
         for waiting in [waiting for waiting in self._waiting if isinstance(waiting.order, kind)]:
             self._waiting.remove(waiting)
             waiting.resolve(outcome)
-
-    # Stopping
 
     async def safe(self) -> None:
         """Halt the robot: wheels and transmitter. The RC is unwell until the radio accepts the halt."""

@@ -48,14 +48,11 @@ class SerialLine:
         await asyncio.to_thread(self._thread.join, CLOSE_TIMEOUT)
 
     def write(self, data: bytes, until: Ns | None = None) -> bool:
-        """Hand a packet to the thread, which then calls `wrote`. Return False if DEPTH packets wait there. After
-        `until`, by the host's clock, the packet is not sent."""
+        """Return False if DEPTH packets wait. The packet is not sent after `until`, by the host's clock."""
         with contextlib.suppress(queue.Full):
             self._queue.put_nowait((data, until))
             return True
         return False
-
-    # In the thread
 
     def _run(self) -> None:
         pause = PAUSES[0]

@@ -81,8 +81,8 @@ _NUMBER: Final = re.compile(r"(?:\[Errno |\()(\d+)[],]")
 
 
 class SerialPort:
-    """`url`: as for pyserial's `serial_for_url`. `dtr`, `rts`: states of these lines after opening; None: pyserial's
-    default. It can be reopened after `close`. Methods raise any exception that pyserial does not catch: see `plain`."""
+    """`url`: for `serial_for_url`. `dtr`, `rts`: states of these lines; None: pyserial's default. It can be reopened
+    after `close`. Methods raise any exception that pyserial does not catch: see `plain`."""
 
     def __init__(self, url: str, baud: int, *, dtr: bool | None = None, rts: bool | None = None) -> None:
         self.url = url
@@ -184,13 +184,12 @@ class SerialPort:
         return getattr(self._port, "_socket", None)
 
     def _bound(self, seconds: float) -> None:
-        """Set how long TCP waits for its peer. While no bytes are sent this must be longer: a lost keepalive probe is
-        not repeated."""
+        """Set how long TCP waits for its peer; longer while nothing is sent, as a lost keepalive probe is not
+        repeated."""
         if self._socket is not None and hasattr(socket, "TCP_USER_TIMEOUT"):
             self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, round(1000 * seconds))
 
     def _connect(self, address: tuple[str, int], timeout: float | None = None) -> socket.socket:
-        """Replaces `socket.create_connection`."""
         failed = OSError(errno.EADDRNOTAVAIL, "no address")
         for family, kind, number, _, to in socket.getaddrinfo(*address, type=socket.SOCK_STREAM):
             connection = socket.socket(family, kind, number)

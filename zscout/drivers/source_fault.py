@@ -54,8 +54,7 @@ _OS: Final = {
 
 
 def why_closed(url: str, timeout: float) -> str | None:
-    """Send a request to the URL, with at most `timeout` seconds for each step. Return the fault as text; None if no
-    fault is found."""
+    """The fault as text, found by a request with at most `timeout` seconds for each step; None if none is found."""
     try:
         parts = urlsplit(url)
         port = parts.port
@@ -141,7 +140,6 @@ def _reply(host: str, port: int, ask: str, timeout: float) -> bytes:
 
 
 def _signed(reply: bytes, url: str, parts: SplitResult) -> str:
-    """The Authorization header for the server's challenge; "" for an unknown scheme."""
     user, password = unquote(parts.username or ""), unquote(parts.password or "")
     wanted = re.findall(rb"^WWW-Authenticate: *(\w+) +(.*?)\r?$", reply, re.IGNORECASE | re.MULTILINE)
     for way, challenge in wanted:

@@ -52,8 +52,7 @@ class Tolerance:
             self._from = now
 
     def expect(self, grant: Grant, do: Mapping[str, Any], now: Ns) -> float:
-        """A holder announces an outage of `seconds`, or with `each` any number of outages of at most `seconds` each.
-        Return the tolerated seconds. Raises Refused."""
+        """Note an outage of `seconds`, with `each` any number of them. Return the tolerated seconds. Raises Refused."""
         seconds, each = do.get("seconds"), do.get("each", False)
         if isinstance(seconds, bool) or not isinstance(seconds, int | float) or not isinstance(each, bool):
             raise Refused("bad_command", "expect_outage needs seconds, as in seconds = 60; `each` is true or false")

@@ -35,8 +35,8 @@ SPACING: Final[Ns] = SECOND // 20
 
 @dataclass(slots=True, eq=False)
 class QueuedPacket:
-    """A holder's packet that was not sent yet. `arrived`: when the first command for it came; `given`: when the current
-    command came, which may have replaced the first; `entered`: when its bucket admitted it to the queue."""
+    """A packet not sent yet. `arrived`: when the first command for it came; `given`: when the present one came, which
+    may have replaced the first; `entered`: when its bucket admitted it."""
 
     place: Place
     grant: Grant
@@ -57,8 +57,8 @@ class QueuedPacket:
 
 @dataclass(frozen=True, slots=True)
 class OutgoingPacket:
-    """A packet to write now. `entered`: when its bucket admitted it to the queue, or when a repeat was due. `sent_by`:
-    when the line has carried it. `until`: do not write it later; None for stops and halts."""
+    """A packet to write now. `entered`: when its bucket admitted it, or a repeat was due. `sent_by`: when the line has
+    carried it. `until`: do not write it later; None for stops and halts."""
 
     packet: Packet
     entered: Fraction
@@ -77,8 +77,6 @@ class _Repeat:
 
 
 class _Robot:
-    """The packet numbers and pending repeats of one robot."""
-
     def __init__(self, first_number: int) -> None:
         self._next = first_number
         self._last: Packet | None = None
@@ -86,7 +84,6 @@ class _Robot:
         self.repeats: list[_Repeat] = []
 
     def number(self) -> int:
-        """Return a new number, for a packet that is not a repeat."""
         self._next, number = (self._next + 1) % 256, self._next
         return number
 
@@ -99,7 +96,6 @@ class _Robot:
         self._count += 1
 
     def repeat(self, repeat: _Repeat, now: Ns) -> Packet:
-        """Return the packet to send now for `repeat`."""
         # The robot may have ignored the very first number, if an earlier radio used it last: repeat with another.
         if repeat.packet is not self._last or self._count == 1:
             repeat.packet = replace(repeat.packet, number=self.number())
@@ -125,8 +121,6 @@ def _remainder(repeat: _Repeat, newer: Packet) -> _Repeat | None:
 
 
 class _HolderQueue:
-    """The bucket and waiting packets of a holder, and the robots that it has commanded."""
-
     def __init__(self, share: Share, now: Ns, *, full: bool) -> None:
         self.share = share
         self.bucket = Bucket(share.size, share.bytes_per_second, now, full=full) if share.rate else None
@@ -150,8 +144,8 @@ class _HolderQueue:
 
 
 class TransmitQueue:
-    """The queue of a line with `rate` bytes a second. A packet that could have been sent more than `stale` ago is
-    dropped, after the line was down or this process stalled. Only stops and halts are sent however late."""
+    """The queue of a line with `rate` bytes a second. Packets held up for more than `stale`, as the line was down or
+    this process stalled, are dropped; stops and halts never."""
 
     def __init__(self, rate: Fraction, *, first_number: int = 0, stale: Ns = SECOND) -> None:
         self._ns_per_byte, self._stale = SECOND / rate, stale
@@ -167,8 +161,6 @@ class TransmitQueue:
         """Unsent drive and camera packets that a newer command made void."""
         self.dropped = 0
         """Unsent packets that became stale, or whose hold ended."""
-
-    # Holders
 
     def join(self, place: Place, share: Share, now: Ns) -> None:
         """A holder begins. On a busy line its bucket starts empty, so that the delay bound holds for all."""
@@ -191,12 +183,9 @@ class TransmitQueue:
         self._reserve.size = Fraction(urgent_burst(len(self.members)))
         return member.robots
 
-    # Adding packets
-
     def offer(self, place: Place, grant: Grant, command: RadioDrive | RadioCamera, now: Ns) -> Ns:
-        """Queue a drive or camera packet of a holder that has joined. Return about how many ns remain until it is sent.
-
-        Raises Refused if too many packets of the holder wait, or if its share has no room for this packet."""
+        """Queue a drive or camera packet of a joined holder. Return about how many ns remain until it is sent. Raises
+        Refused if too many of its packets wait, or if its share has no room for this packet."""
         member = self.members[place]
         waiting = QueuedPacket(place, grant, command, now, now)
         if member.bucket is None:
@@ -229,8 +218,8 @@ class TransmitQueue:
         return round(begins - now + waiting.size * self._ns_per_byte)
 
     def send_urgent(self, robot: int, kind: type[StopPacket] | type[HaltPacket], now: Ns) -> Ns:
-        """Queue a stop or a halt ahead of all waiting packets. It makes waiting drive packets for this robot void; a
-        halt also camera packets. Return about how many ns remain until it is sent."""
+        """Queue a stop or halt ahead of all packets, and drop its waiting drive packets; for a halt also camera
+        packets. Return about how many ns remain until it is sent."""
         void = (RadioDrive,) if kind is StopPacket else (RadioDrive, RadioCamera)
         self.replaced += self._remove(lambda packet: packet.command.robot == robot and isinstance(packet.command, void))
         first, since = self._urgent.get(robot, (kind, now))
@@ -238,7 +227,7 @@ class TransmitQueue:
         return self._time_for((list(self._urgent).index(robot) + 1) * OVERHEAD, now)
 
     def _remove(self, gone: Callable[[QueuedPacket], bool]) -> int:
-        """Remove the waiting packets for which `gone` is true. Return their number."""
+        """Return how many were removed."""
         before = self.waiting
         self._queue = deque(waiting for waiting in self._queue if not gone(waiting))
         for member in self.members.values():
@@ -246,14 +235,11 @@ class TransmitQueue:
         return before - self.waiting
 
     def _time_for(self, size: int, now: Ns) -> Ns:
-        """The ns until `size` more bytes are sent."""
         return round(max(self._free_at - now, Fraction(0)) + size * self._ns_per_byte)
 
-    # Sending packets
-
     def next(self, now: Ns, in_force: Callable[[Grant], bool]) -> OutgoingPacket | None:
-        """Return the packet to write now, if there is one and the line has room. `in_force` returns True if a hold is
-        still in force, without which its packets are dropped."""
+        """Return the packet to write now, if there is one and the line has room. Packets of holds not `in_force` are
+        dropped."""
         if self._free_at - now > self._ahead:
             return None
         self._release(now)
@@ -295,12 +281,10 @@ class TransmitQueue:
 
     @property
     def urgent(self) -> int:
-        """Number of unsent halts and stops."""
         return len(self._urgent)
 
     @property
     def waiting(self) -> int:
-        """Number of unsent drive and camera packets."""
         return len(self._queue) + sum(len(member.waiting) for member in self.members.values())
 
     def _release(self, now: Ns) -> None:
@@ -309,7 +293,6 @@ class TransmitQueue:
         self._queue.extend(sorted(entering, key=lambda waiting: waiting.entered))
 
     def _repeats(self) -> Iterator[tuple[_Robot, _Repeat]]:
-        """Yield the next repeat of each robot."""
         for robot in self._robots.values():
             if robot.repeats:
                 yield robot, min(robot.repeats, key=lambda repeat: repeat.due)

@@ -52,13 +52,12 @@ class UseCounter:
         self._held[grant] = _Use()
 
     def direct_began(self, grant: Grant, now: Ns) -> None:
-        """A direct hold has begun at the driver."""
         if (use := self._held.get(grant)) is not None:
             use.since, use.direct = now if use.since is None else use.since, True
 
     def carried_out(self, grant: Grant, began: Ns, now: Ns) -> None:
-        """Count a command from `began` until now, under a grant that was held when it began. Can be called from a
-        second thread: at worst the time of a single command is lost."""
+        """Count a command under a grant that was held at `began`. From a second thread, at worst one command's time is
+        lost."""
         use = self._held.get(grant)
         if use is None:
             if (use := self._ended.get(grant)) is None:

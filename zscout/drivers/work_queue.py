@@ -16,10 +16,9 @@ EARLY_PER_HOST = 16
 
 
 class WorkQueue:
-    """Changes of holders come first, so that a safe state never waits for a command.
-
-    A command under a grant that the RC does not know yet is set aside until the RC knows more, and then precedes all
-    other commands, so that no later command of the same grant overtakes it."""
+    """Changes of holders come first, so that a safe state never waits for a command. A command under a grant that the
+    RC does not know yet is set aside until the RC knows more, and then precedes all other commands, so that no later
+    command of the same grant overtakes it."""
 
     def __init__(self) -> None:
         self._changes: deque[HoldChange] = deque()
@@ -36,7 +35,6 @@ class WorkQueue:
 
     @property
     def early(self) -> int:
-        """Number of commands set aside."""
         return len(self._early)
 
     def put_change(self, change: HoldChange) -> None:
@@ -69,12 +67,10 @@ class WorkQueue:
             self._wakeup.set()
 
     def drop_early(self) -> list[CommandQuery]:
-        """Remove and return the commands that are still set aside."""
         dropped, self._early = self._early, []
         return [command for _, command in dropped]
 
     async def get(self) -> HoldChange | CommandQuery:
-        """Wait for the next change or command."""
         while not (self._changes or self._commands):
             self._wakeup.clear()
             await self._wakeup.wait()

@@ -38,8 +38,8 @@ PICTURE_WAIT: Final = 60.0
 
 
 class Revoked(Exception):
-    """The hold was taken away, or its time is over. `outcome` is one of the outcomes of the protocol, such as
-    `preempted`; `by` names the request that took it; the message is the reason."""
+    """The hold was taken away, or its time is over. `outcome` is the protocol's, such as `preempted`; `by` names the
+    request that took it; the message is the reason."""
 
     def __init__(self, arc: OpenArc, ending: HoldEnd | None = None) -> None:
         ending = ending or arc._ending or HoldEnd(arc.outcome or "lost", arc.reason, arc.by)
@@ -193,7 +193,6 @@ class Held:
 
     @property
     def _words(self) -> str:
-        """The request, its devices, and the time left, or why the hold ended."""
         if self.active and not self.completed:
             status = f"{self.remaining:.0f} s left" if self.remaining > 0 else kept(self.arc.priority)
         else:
@@ -243,7 +242,6 @@ class Attempt:
 
     @property
     def goes_on(self) -> bool:
-        """True if it can be entered again."""
         return self._needs_new_request or (self.arc is not None and self.arc.open)
 
     async def asked(self) -> OpenArc:
@@ -330,7 +328,6 @@ _ASKED = (
 
 
 def _ask(*values: Any) -> dict[str, Any]:
-    """Return the arguments for `Client.request`."""
     return dict(zip(_ASKED, values, strict=True))
 
 

@@ -207,8 +207,6 @@ async def _close(frames: AsyncGenerator[Frame, None]) -> None:
 
 
 class BlockingAttempt(AbstractContextManager[BlockingHeld, None]):
-    """The result of `Lab.hold`: entering it waits for the grant, leaving it gives the devices back."""
-
     def __init__(self, lab: Lab, attempt: Attempt, *, interrupt: bool) -> None:
         self._lab, self._attempt, self._interrupt = lab, attempt, interrupt
         self._held: BlockingHeld | None = None
@@ -249,8 +247,6 @@ class BlockingAttempt(AbstractContextManager[BlockingHeld, None]):
         finally:
             if self._held is not None:
                 self._held._body.leave()
-
-    # In the loop's thread
 
     async def _granted(self) -> Held:
         self._entering = asyncio.current_task()

@@ -238,14 +238,14 @@ def _is_answer(reply: Reply[Any]) -> bool:
 
 
 def _whole_second(at: datetime) -> int:
-    """Return Unix seconds. Raises ValueError for a time without a zone."""
+    """Raises ValueError for a time without a zone."""
     if at.tzinfo is None:
         raise ValueError(f"{at} has no zone; write one: datetime(..., tzinfo=ZoneInfo('Europe/Berlin'))")
     return round(at.timestamp())
 
 
 def _zone(start: datetime, every: int) -> str:
-    """Return the name of a time's zone. Raises ValueError if a repeated booking has no named zone."""
+    """Raises ValueError if a repeated booking has no named zone."""
     if isinstance(start.tzinfo, ZoneInfo):
         return start.tzinfo.key
     if every and start.utcoffset() != timedelta(0):

@@ -129,8 +129,6 @@ class Client:
         others = f"{links} link{'s' * (links > 1)} to other programs" if links else "no other program either"
         raise NoRcm(f"{no_leader} ({others})", CHECK_FLEET)
 
-    # Requests
-
     async def request(
         self,
         name: str,
@@ -244,8 +242,6 @@ class Client:
         if reply is None or reply.message is None:
             unknown = Problem("unknown", "the leader did not answer; the request may or may not have been handed over")
             raise RequestRefused(reply.problem or unknown if reply is not None else unknown)
-
-    # Queries
 
     async def state(
         self, arc: str | None = None, *, forecast: bool = False, timeout: float = QUERY_TIMEOUT

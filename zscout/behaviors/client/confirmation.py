@@ -50,8 +50,6 @@ HOLD_BACK_LIMIT = 30.0
 
 @dataclass(slots=True)
 class Confirmation:
-    """The confirmation of one grant by its RCs."""
-
     grant: Grant
     task: asyncio.Task[None] | None = None
     all: bool = False
@@ -69,8 +67,6 @@ class Confirmation:
 
 
 class Confirmations:
-    """The confirmations of one client's grants."""
-
     def __init__(
         self,
         mesh: Mesh,
@@ -98,7 +94,6 @@ class Confirmations:
         return known
 
     def pending(self, grant: Grant) -> Confirmation | None:
-        """Return the unfinished confirmation of a grant, if any."""
         return next((known for known in self._by_request.values() if known.grant == grant and known.pending), None)
 
     def _look_at(self, arc: OpenArc) -> None:
@@ -150,11 +145,9 @@ class Confirmations:
         self._store.notify(arc)
         self._ask_again(arc)
 
-    # Queries to RCs
-
     async def _confirm(self, arc: OpenArc, grant: Grant) -> list[CommandRefused]:
-        """Ask all RCs of a grant, concurrently. Return the refusals of RCs that did not confirm it within a second, not
-        counting stalls of this client, or that settled until its time was over."""
+        """Ask all RCs of a grant, concurrently. Return the refusals of RCs that did not confirm it within a second
+        without stalls of this client, or settled until its time was over."""
         direct = self._open_direct(arc, grant) if arc.direct else None
         asked = arc.rcs
         while True:
@@ -182,7 +175,7 @@ class Confirmations:
         return zip(rcs, await asyncio.gather(*asked), strict=True)
 
     async def _query_host(self, grant: Grant, host: HostName, rcs: list[RcName]) -> Mapping[RcName, Done | Problem]:
-        """Return the answers of a host's RCs to one common query, without foreign RCs, which it does not cover."""
+        """Return the answers of a host's RCs to one query; foreign RCs give none."""
         answers: dict[RcName, Done | Problem] = {}
 
         def on_reply(reply: Reply[Confirmed]) -> bool:
@@ -208,8 +201,8 @@ class Confirmations:
         deadline: Ns,
         first: tuple[Ns, Done | Problem | None],
     ) -> CommandRefused | None:
-        """Ask one RC until it confirms or refuses; return its refusal. `first`: when the common query was sent, and
-        this RC's answer to it, if any."""
+        """Ask one RC until it confirms or refuses; return its refusal. `first`: when the host was asked, and its
+        answer."""
         pause, (sent, answer) = BACKOFF[0], first
         while True:
             if answer is None:
@@ -254,8 +247,8 @@ class Confirmations:
         self._mesh.suspicions.suspect(f"{rc} {what}", so=silent, patience=patience)
 
     async def _ask_when_reachable(self, arc: OpenArc, rcs: list[RcName]) -> None:
-        """Report RCs that did not confirm as reachable again, so that `arc` is held back no longer, once their tokens
-        have disappeared and returned: then links are back."""
+        """Let `arc` be granted again as soon as these RCs' tokens have disappeared and returned: then links are
+        back."""
         keys, back = self._mesh.keys, asyncio.Event()
         gone = {rc for rc in rcs if not await self._mesh.living(keys.alive_rc(rc), timeout=QUERY_TIMEOUT)}
 
@@ -275,8 +268,6 @@ class Confirmations:
                     await self._store.changed(arc)
                 if arc.state == "queued" and self._store.resumed.is_set():
                     await self._rcm.ask(arc, reachable=True)
-
-    # Direct holds
 
     def direct(self, grant: Grant) -> DirectHold | None:
         return self._direct.get(grant)

@@ -62,8 +62,6 @@ class DirectHold:
         self._reports: dict[str, asyncio.Task[None]] = {}
         self._confirming: asyncio.Task[None] | None = None
 
-    # For the runner of the program
-
     @property
     def sure_until(self) -> Ns:
         """Time until which the hold is safe; it grows with each round of confirmations."""
@@ -87,23 +85,21 @@ class DirectHold:
 
     @property
     def gone_by(self) -> Ns:
-        """Time by which the program must have been killed, whatever happens to this client. It grows with `sure_until`
-        while the hold is in force, and may shrink at its end."""
+        """When the program is killed at the latest. It grows with `sure_until`, and may shrink at the hold's end."""
         end = self.sure_until if self.ended_at is None else min(self.ended_at, self.sure_until)
         return end + self.grace
 
     @property
     def over(self) -> bool:
-        """True once the hold has ended: the program must end now, by `gone_by` at the latest."""
         return self.ended_at is not None
 
     def watch(self, watcher: Callable[[DirectHold], object]) -> None:
-        """Call `watcher(hold)` whenever `gone_by` has changed, and at the end of the hold, before `leaving` is sent. It
-        must not block."""
+        """Call `watcher(hold)` when `gone_by` changes, and at the hold's end before `leaving` is sent. It must not
+        block."""
         self._watchers.append(watcher)
 
     def returned(self) -> None:
-        """Report that the whole program has ended, so that the RCs stop settling. May be called repeatedly."""
+        """Report that the whole program has ended, so that the RCs stop settling. May be repeated."""
         if not self.gone:
             self.gone = True
             self._stop_confirming()
@@ -111,10 +107,7 @@ class DirectHold:
 
     @property
     def reporting(self) -> list[asyncio.Task[None]]:
-        """Reports to its RCs that are under way and still of use."""
         return [task for task in self._reports.values() if not task.done()]
-
-    # For the client
 
     def confirmed(self, rc: RcName, sent: Ns, done: Done) -> None:
         """Take the answer `done` of `rc` to a confirmation sent at `sent`."""
@@ -128,8 +121,7 @@ class DirectHold:
         return [rc for rc in self.rcs if self._confirmed.get(rc, since) <= since]
 
     def keep_confirming(self, on_unsure: Callable[[DirectHold], object]) -> None:
-        """Confirm the grant periodically from now on. Calls `on_unsure(self)` if an RC has not answered for a hold
-        lease."""
+        """Calls `on_unsure(self)` if an RC has not answered for a hold lease."""
         if self._confirming is None and not (self.over or self.gone):
             self._confirming = self._spawn(self._keep_confirming(on_unsure))
 

@@ -36,8 +36,6 @@ CLAIM_TIMEOUT = 10.0
 
 
 class MovableClient:
-    """The base of a client that can hand over its requests, and receive another client's."""
-
     def __init__(self, mesh: Mesh, fleet: Fleet, supervisor: Supervisor) -> None:
         self.mesh, self.fleet, self.supervisor = mesh, fleet, supervisor
         self.store = RequestStore(mesh.now, self._ask_soon)
@@ -49,8 +47,6 @@ class MovableClient:
         self._may_end = asyncio.Event()
         """Cleared while the client is paused, until it leaves."""
         self._may_end.set()
-
-    # The new client
 
     def expect(self, requests: Sequence[OpenRequest]) -> None:
         """Expect another client to hand over `requests`; `request` then returns them, by name and needs. They replace
@@ -105,8 +101,8 @@ class MovableClient:
         return arc if arc.open else None
 
     async def _await_handover(self, arc: OpenArc) -> None:
-        """Wait until an expected ARC is handed over. After EXPECT_TIMEOUT, adopt it to submit it, under its id and at
-        its place: it may have been handed over without this client's notice."""
+        """Wait until an expected ARC is handed over. After EXPECT_TIMEOUT, submit it under its id at its place: the
+        notice may be lost."""
         try:
             async with asyncio.timeout(EXPECT_TIMEOUT):
                 while arc.id in self.store.expected:
@@ -131,11 +127,9 @@ class MovableClient:
                 log.warning("giving back %s: it was handed over, and not requested here", arc.name)
                 await self.rcm.end(arc)
 
-    # The old client
-
     def pause(self) -> None:
-        """Until `resume`, `take_back`, `close` or `leave`, submit and end no request, and enter and interrupt no body.
-        Notices are still applied."""
+        """Until `resume`, `take_back`, `close` or `leave`, submit and end no request, and interrupt no body; apply
+        notices."""
         self._may_end.clear()
         self.store.resumed.clear()
         self.store.undecided.clear()
@@ -172,7 +166,6 @@ class MovableClient:
             self.store.forget(arc)
 
     def open_requests(self) -> list[OpenRequest]:
-        """Return the requests that an RCM has answered and that are not over, which `hand_over_all` would hand over."""
         now = self.mesh.now()
         return [arc._open_request(now) for arc in self.store.acknowledged]
 
@@ -234,8 +227,7 @@ class MovableClient:
             pause = FIRST_PAUSE if await self.rcm.leader_within(pause) else min(longest, pause * 2)
 
     async def _awaited_by(self, to: Sender) -> set[str]:
-        """Return the ids of the requests that `to` expects without a notice yet; none, trusting the RCM, if `to` does
-        not answer."""
+        """The ids that `to` expects without a notice yet; none, trusting the RCM, if `to` does not answer."""
         reply = await self.mesh.ask_one(self.mesh.keys.requests(to), RcAsk(), ClientRequests, timeout=QUERY_TIMEOUT)
         requests = reply.message.requests if reply is not None and reply.message is not None else []
         return {request.id for request in requests if request.place is None}

@@ -38,14 +38,12 @@ class HoldNotice(NamedTuple):
         return cls(end.code, end.by, end.rcs, now + round(end.safe * SECOND), begins)
 
     def is_like(self, other: HoldNotice, now: Ns) -> bool:
-        """Return True if `other` has the same content, except for small differences of its times."""
         times = ((self.safe_until, other.safe_until), (self.begins or 0, other.begins or 0))
         close = all(abs(max(mine, now) - max(theirs, now)) < SAME for mine, theirs in times)
         return close and (self.by.client, self.by.id, self.rcs) == (other.by.client, other.by.id, other.rcs)
 
     def text(self, now: Ns, clock: Callable[[float], str] | None = None, by: str = "") -> str:
-        """Return a text for people. `clock` formats the time of day that is so many seconds from now; `by` replaces the
-        name of the request or booking."""
+        """`clock` formats the time of day in so many seconds; `by` replaces the name of the request or booking."""
         by = by or named(self.by.who, self.by.client, self.by.arc)
         rcs = ", ".join(self.rcs)
         if self.withdrawn:

@@ -18,13 +18,13 @@ _MAIN = ("__main__", "__init__")
 
 
 def this_program(host: str) -> Who:
-    """Return the user, `host` and name of this program, without arguments, which may contain secrets."""
+    """Without the program's arguments, which may contain secrets."""
     return Who(bounded(_user()), bounded(host), bounded(_program()))
 
 
 def host_of(fleet: Fleet) -> str:
-    """Return the host in this program's keys: the name in its certificate, of a machine or a person; without
-    certificates $ZSCOUT_HOST, else this machine's name. Raises BadInput."""
+    """This program's host in keys: its certificate's name; without certificates $ZSCOUT_HOST, else this machine. Raises
+    BadInput."""
     if fleet.security is not None:
         return read_certificates(fleet.security).name
     return os.environ.get("ZSCOUT_HOST") or this_machine()
@@ -35,7 +35,6 @@ def this_machine() -> str:
 
 
 def bounded(text: str, most: int = MAX_WHO) -> str:
-    """Return a text on one line, cut to `most` characters, with a `…` for the rest."""
     text = " ".join(clean(text).split())
     return text if len(text) <= most else text[: most - 1].rstrip() + "…"
 

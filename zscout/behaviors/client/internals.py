@@ -36,8 +36,6 @@ TOKEN_RENEWAL_INTERVAL: Final[Ns] = SECOND // 2
 
 
 class ClientInternals(MovableClient):
-    """The internals of one client."""
-
     def __init__(self, mesh: Mesh, fleet: Fleet) -> None:
         super().__init__(mesh, fleet, Supervisor(f"client {mesh.me}", self._failed))
         self.confirmations = Confirmations(
@@ -56,10 +54,7 @@ class ClientInternals(MovableClient):
         self._expired: set[str] = set()
         """Ids of ARCs that are over by this host's clock, and not yet by a notice."""
 
-    # On the mesh
-
     def start(self) -> None:
-        """Make the client's declarations on the mesh, and start its tasks."""
         keys, mesh = self.mesh.keys, self.mesh
         self._declared = [mesh.subscribe(keys.notice(mesh.me), Notice, self._on_notice), *self.rcm.start()]
         mesh.watch_links()
@@ -83,7 +78,6 @@ class ClientInternals(MovableClient):
         super()._ask_soon(arc)
 
     async def close(self) -> None:
-        """Give back everything and leave the mesh."""
         try:
             if self.leaving is None:
                 self.store.resumed.set()
@@ -96,8 +90,8 @@ class ClientInternals(MovableClient):
             await self.leave()
 
     async def leave(self) -> None:
-        """Leave the mesh without giving anything back, for a client that has handed over all. The RCM ends what is left
-        when the token disappears."""
+        """Leave the mesh without giving anything back: all was handed over. The RCM ends the rest as the token
+        disappears."""
         self.leaving = self.leaving or asyncio.create_task(self._leave())
         # Its token must go even if the caller is cancelled.
         await asyncio.shield(self.leaving)
@@ -122,13 +116,9 @@ class ClientInternals(MovableClient):
 
     @property
     def term(self) -> Term:
-        """The highest term received or promised; messages of lower terms are ignored."""
         return self.rcm.term
 
-    # Its holds
-
     def watch(self, watcher: Callable[[OpenArc], None]) -> None:
-        """Call `watcher(arc)` whenever a request of this client has changed."""
         self.store.watchers.append(watcher)
 
     async def confirmed(self, arc: OpenArc) -> bool:
@@ -140,8 +130,7 @@ class ClientInternals(MovableClient):
         return arc.grant == grant and confirmation.all
 
     def direct_hold(self, grant: Grant) -> DirectHold | None:
-        """Return the direct hold of this grant, for the runner of its program. None if the request is not direct, or
-        the end of its program has been reported."""
+        """None if the request is not direct, or the end of its program has been reported."""
         return self.confirmations.direct(grant)
 
     async def end(self, arc: OpenArc) -> None:
@@ -158,8 +147,7 @@ class ClientInternals(MovableClient):
         await self.rcm.end(arc)
 
     def complete(self, arc: OpenArc) -> None:
-        """End an ARC whose time is over by this host's clock and whose body has returned; RCs and RCM end it by their
-        clocks."""
+        """End an ARC whose time is over by this host's clock and whose body has returned."""
         self.confirmations.program_is_gone(arc)
         self.expire(arc)
 
@@ -173,14 +161,12 @@ class ClientInternals(MovableClient):
         self.store.forget(arc)
 
     def _give_back_unreported(self, request_id: str) -> None:
-        """Give back a hold that is over by this host's clock, and not by a notice: the leader may have granted it
-        again, and that notice was lost."""
+        """Give back a hold that expired here without a notice: the leader may have granted it again, and that was
+        lost."""
         expired = request_id in self._expired
         self._expired.discard(request_id)
         if expired and request_id not in self.store.arcs:  # it may have been submitted again
             self.supervisor.spawn(self.rcm.give_back(Release(id=request_id)))
-
-    # Commands, and notices
 
     async def command(
         self, rc: str, grant: Grant, do: Mapping[str, Any], *, ttl: float = 1.0, timeout: float = 2.0

@@ -69,7 +69,6 @@ class InterruptibleBody:
             pause = min(2 * pause, LONGEST_REPEAT) if self._off_stack else REPEAT_AFTER
 
     def is_on(self, frames: list[FrameType]) -> bool:
-        """Return True if its function is on this stack."""
         self._off_stack = self._frame not in frames
         return not self._off_stack
 
@@ -119,8 +118,8 @@ def _outwards(frame: FrameType | None) -> Iterator[FrameType]:
 
 
 def _body_of(frame: FrameType) -> FrameType | None:
-    """Return the frame of the function that contains the body of a `with` entered from `frame`. A generator with
-    `@contextmanager` is suspended during the body, so it is skipped for its user."""
+    """The frame of the body of a `with` entered from `frame`: of the user of a generator with `@contextmanager`, which
+    is suspended."""
     frames = [*_outwards(frame)]
     for use, caller in zip(frames, [*frames[1:], None], strict=True):
         if _module(use).startswith(("contextlib", __package__)):

@@ -53,15 +53,12 @@ class PlacerClient:
     def __exit__(self, *_: object) -> None:
         self._subscription.close()
 
-    # Requests
-
     async def place(self, component: ComponentId, spec: ComponentSpec, *, wait: float = 3.0) -> Placement:
-        """Start a component on some host, unless it runs; return its placement. `wait`: seconds for which the placer
-        waits for the start. Raises RequestRefused."""
+        """`wait`: seconds for which the placer waits for the start. Raises RequestRefused."""
         return await self.request(messages.PlaceComponent(component, spec, wait=wait), Placement)
 
     async def stop(self, component: ComponentId, *, wait: float = 0.0) -> Placement:
-        """Stop a component for good. Raises RequestRefused."""
+        """Raises RequestRefused."""
         return await self.request(messages.EndComponent(component, wait=wait), Placement)
 
     async def request(self, operation: PlacerOperation, kind: type[R]) -> R:
@@ -72,8 +69,8 @@ class PlacerClient:
         return await self._until(lambda: self._ask(operation, kind), f"{silent}; {remedy}")
 
     async def request_once(self, operation: PlacementOperation, done: Callable[[Placement], bool]) -> Placement:
-        """Like `request`, for an operation that is not idempotent: without an answer, it is repeated only if
-        `done(placement)` is false for the component's placement. Raises RequestRefused, PlacerSilent."""
+        """Like `request`, but not idempotent: without an answer it is repeated only while `done` is false for the
+        component's placement. Raises RequestRefused, PlacerSilent."""
 
         async def attempt() -> Placement | None:
             if (answer := await self._ask(operation, Placement)) is not None:
@@ -95,8 +92,6 @@ class PlacerClient:
                 raise PlacerSilent(Problem("unknown", silent))
             await asyncio.sleep(RETRY_AFTER)
 
-    # Placements
-
     async def refresh(self) -> None:
         """Query all placements, or those in `only`. Raises RequestRefused, PlacerSilent."""
         self._listed(await self.request(self._list, Placements))
@@ -107,8 +102,8 @@ class PlacerClient:
             self._listed(listed)
 
     async def wait_changed(self) -> None:
-        """Wait for the next publication or answer; after REFRESH_EVERY seconds without one, refresh. Raises
-        RequestRefused, PlacerSilent."""
+        """Wait for a publication or answer; after REFRESH_EVERY seconds, refresh. Raises RequestRefused,
+        PlacerSilent."""
         if not await done_within(REFRESH_EVERY, self.changed.wait()):
             await self.refresh()
         self.changed.clear()

@@ -58,9 +58,6 @@ class _TermOnly(msgspec.Struct, frozen=True):
 
 
 class RcmLink:
-    """Follows the RCM for one client, reports the client's requests to new leaders, and submits and withdraws
-    requests."""
-
     def __init__(self, mesh: Mesh, fleet: Fleet, store: RequestStore, supervisor: Supervisor) -> None:
         self.mesh, self.fleet, self.store, self._supervisor = mesh, fleet, store, supervisor
         self.key = mesh.keys.schedule(mesh.me)
@@ -92,16 +89,14 @@ class RcmLink:
             Declaration(self._stall.start().stop),
         ]
 
-    # The leader
-
     @property
     def leader(self) -> str | None:
         """The host of the leading node; None if no RCM is visible."""
         return next((token.host for token in sorted(self._leaders)), None)
 
     def accept(self, term: Term, *, promise: bool = False, above: bool = False) -> bool:
-        """Return True if messages of `term` count, and keep the highest term. `promise`: the term is a candidate's.
-        `above`: accept even an absurdly high term, as an RC already obeys one."""
+        """Return True if messages of `term` count, and keep the highest. `promise`: the term is a candidate's. `above`:
+        accept even an absurdly high term, as an RC already obeys one."""
         if term < self.term and not promise and self._only_promised(term):
             self._go_back(term)
         if term < self.term or absurd(term, self.term, heard=self._in_contact and not above):
@@ -118,8 +113,8 @@ class RcmLink:
         return self.mesh.keys.closed and newer and any(token.instance == term.rcm for token in self._leaders)
 
     async def _follow_lower(self, terms: list[Term]) -> None:
-        """Return to a visible leader of a lower term that RCs obey, if no message of the highest term arrived for the
-        hold lease. Only with certificates: without them the fleet moves above the highest term instead."""
+        """Return to a visible leader of a lower term that RCs obey, if none of the highest published for a hold lease.
+        Only with certificates: without them the fleet moves above the highest term instead."""
         now, lease = self.mesh.now(), self.fleet.timing.hold_lease
         term = max(terms, default=NO_TERM)
         if not self.mesh.keys.closed or self._in_contact or term >= self.term:
@@ -163,7 +158,6 @@ class RcmLink:
 
     @property
     def who(self) -> str:
-        """The leader, in words for people."""
         return "the leader" if self.leader is None else f"the leader at {self.leader}"
 
     async def leader_within(self, seconds: float) -> bool:
@@ -219,11 +213,8 @@ class RcmLink:
                     arc._lose("no leader published within the hold lease", now)
                     self.store.notify(arc)
 
-    # Requests
-
     async def query(self, operation: Operation) -> Reply[Notice] | None:
-        """Send an operation; return the answer, preferably of a current RCM. None: no answer came, and the operation
-        may have been carried out."""
+        """The answer, preferably of a current RCM. None: none came, and the operation may have been carried out."""
         replies = await self.mesh.ask(self.key, operation, Notice, timeout=QUERY_TIMEOUT, enough=self._is_current)
         if not replies or not self._contact_is_fresh or self.mesh.suspicions.any:
             await self._look_for_contradictions(silent=not replies)
@@ -231,13 +222,12 @@ class RcmLink:
         return reply if reply is None or reply.problem is None else naming_versions(reply, self.who)
 
     def _is_current(self, reply: Reply[Notice]) -> bool:
-        """Return True unless the reply is from an RCM that has been replaced."""
         if reply.message is not None:
             return reply.message.term >= self.term
         return reply.problem is None or reply.problem.code not in DEPOSED
 
     async def _look_for_contradictions(self, *, silent: bool) -> None:
-        """Suspect the mesh session if the leader's token, its publications and its answers contradict each other, or if
+        """Suspect the mesh session if the leader's token, publications and answers contradict each other, or if
         candidates are visible and none leads for long."""
         heard = self._contact_is_fresh
         there, suspect = self.leader is not None or heard, self.mesh.suspicions.suspect
@@ -290,8 +280,8 @@ class RcmLink:
         return reply.problem
 
     async def keep_asking(self) -> NoReturn:
-        """Submit all open requests again, and withdraw those given up, at every change of the RCM and every few
-        seconds; sooner if the RCM did not answer."""
+        """Repeat all requests and withdrawals at every change of the RCM and every few seconds; sooner without an
+        answer."""
         unanswered, known = False, self._changes
         while True:
             if self._changes == known:
@@ -315,8 +305,7 @@ class RcmLink:
                     break
 
     async def end(self, arc: OpenArc) -> None:
-        """Give back a hold, or leave the queue. Return when an RCM has answered, or after a few tries, which
-        `keep_asking` continues."""
+        """Give back a hold, or leave the queue. Return once answered, or after a few tries; `keep_asking` continues."""
         running = arc.state == "running"
         # `left`: its program has left the devices.
         self.store.withdrawn[arc.id] = (Release if running else Cancel)(id=arc.id, left=True)
@@ -333,7 +322,7 @@ class RcmLink:
         await self._withdraw(operation.id)
 
     async def _withdraw(self, request_id: str) -> bool:
-        """Send a pending withdrawal once; return True if none is pending any more."""
+        """Return True if no withdrawal is pending any more."""
         if (operation := self.store.withdrawn.get(request_id)) is None:
             return True
         reply = await self.query(operation)

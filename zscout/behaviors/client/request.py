@@ -174,8 +174,7 @@ class OpenArc:
         return self.state in ("asking", "queued", "running", "awaited")
 
     def _take(self, notice: Notice, now: Ns) -> bool:
-        """Apply a notice of this request. Return False, with nothing changed, if it is outdated or reports a hold of
-        other devices than requested."""
+        """Apply a notice. Return False, with nothing changed, if it is outdated or has other devices than requested."""
         if (notice.term, notice.step) <= self._last or not self.open:
             return False
         if (bound := self._binding(notice)) is None:
@@ -208,8 +207,7 @@ class OpenArc:
         return True
 
     def _binding(self, notice: Notice) -> dict[str, str] | None:
-        """Return by pattern the RC that satisfies it. None if the notice's RCs don't satisfy the needs, as may be after
-        a false report by a node."""
+        """The RC for each pattern. None if the RCs don't satisfy the needs, as after a false report by a node."""
         bound = {need: notice.bound.get(need, "") for need in self.needs if is_pattern(need)}
         if notice.state != "running":
             return {}
@@ -241,32 +239,28 @@ class OpenArc:
         self._lose(reason, now)
 
     def _not_served(self, grant: Grant | None, now: Ns) -> None:
-        """Give up a grant whose time passed while its RCs were settling; the request is submitted again, at its
-        place."""
+        """Give up a grant whose time passed while its RCs were settling; it keeps its place."""
         self._lose("its time passed while its devices settled", now)
         self._unserved, self._settling = grant, None
 
     def _finish(self, outcome: str, reason: str, now: Ns) -> None:
-        """End the request by the client's own judgement."""
         self._end_hold(HoldEnd(outcome, reason), now)
         self.state, self.outcome, self.reason, self.since = "ended", outcome, reason, now
         self.why = None
 
     def _must_show_place(self, notice: Notice) -> bool:
-        """Return True if the client must show its place to the RCM, which has assigned a worse one in answer to an
-        older query; at most once per term."""
+        """Return True if the RCM gave it a worse place in answer to an older query; at most once per term."""
         if notice.state != "queued" or notice.place is None or notice.place == self._place:
             return False
         shown, self._place_shown_in = self._place_shown_in, notice.term
         return shown != notice.term
 
     def _reopen(self, now: Ns) -> None:
-        """Undo an end with outcome `client_lost`, as this client lives; the request is submitted again, at its
-        place."""
+        """Undo an end as `client_lost`, as this client lives; the request keeps its place."""
         self.state, self.since, self.why = "asking", now, None
 
     def _take_first(self, notice: Notice, now: Ns) -> bool:
-        """Apply the first notice of an expected request. Return False if it is an end, outdated, or of other
+        """Apply the first notice of an expected request. Return False for an end, an outdated notice or other
         devices."""
         before, self.state = self.state, "asking"
         if notice.state != "ended" and self._take(notice, now):
@@ -276,8 +270,7 @@ class OpenArc:
         return False
 
     def _must_be_handed_over_again(self, notice: Notice) -> bool:
-        """Return True if, by a later RCM, the request still belongs to the client that handed it over at an earlier
-        RCM; that client must repeat the hand-over."""
+        """Return True if by a later RCM it still belongs to the client that handed it over, which must do so again."""
         return (
             self.open
             and notice.outcome == "handed_over"
@@ -286,7 +279,6 @@ class OpenArc:
         )
 
     def _await_again(self, notice: Notice, now: Ns) -> None:
-        """Await the repeated hand-over."""
         self._lose("waiting for its old client to hand it over again", now)
         self.state, self._moved_in, self._last = "awaited", None, (notice.term, notice.step)
 
@@ -329,7 +321,6 @@ class OpenArc:
         )
 
     def _open_request(self, now: Ns) -> OpenRequest:
-        """Return the request as reported to a new leader."""
         return self._as_asked(now, self.grant)
 
     def _as_asked(self, now: Ns, grant: Grant | None) -> OpenRequest:
@@ -373,13 +364,11 @@ def check_seconds(what: str, value: Any) -> None:
 
 
 class RequestStore:
-    """A client's requests that are not over, by id. Notifies waiters of their changes, and holds the client's paused
-    state."""
+    """A client's requests that are not over, by id, and its paused state."""
 
     def __init__(self, now: Callable[[], Ns], ask_again: Callable[[OpenArc], object]) -> None:
-        """`ask_again` is called with each request that must be submitted again: the RCM dropped it because this client
-        seemed gone, or assigned a worse place; or it is `awaited`: by a later RCM it still belongs to the client that
-        handed it over."""
+        """`ask_again` gets each request to submit again: the RCM dropped it because this client seemed gone, or
+        assigned a worse place; or it is `awaited`."""
         self._now, self._ask_again = now, ask_again
         self.arcs: dict[str, OpenArc] = {}
         self.moved: dict[str, OpenArc] = {}
@@ -412,8 +401,7 @@ class RequestStore:
         self.arcs[arc.id] = arc
 
     def expect(self, arc: OpenArc) -> None:
-        """Expect `arc` from another client. If it was handed over to that client before, earlier notices are
-        outdated."""
+        """Expect `arc` from another client. Notices from before it was last handed over there are outdated."""
         if (before := self.moved.pop(arc.id, None)) is not None:
             arc._last, arc._change = before._last, before._change
         self.withdrawn.pop(arc.id, None)
@@ -432,7 +420,6 @@ class RequestStore:
         self.expected.pop(arc.id, None)
 
     def notify(self, arc: OpenArc) -> None:
-        """Wake all tasks that wait for a change of `arc`, and call the watchers."""
         arc._change.set()
         for watcher in self.watchers:
             watcher(arc)
@@ -478,8 +465,7 @@ class RequestStore:
                 self.forget(arc)
 
     def _submit_under_new_id(self, arc: OpenArc) -> None:
-        """Submit a request again, under a new id at its old place: its time was over before this client received the
-        grant."""
+        """Submit a request under a new id at its old place: its time was over before the grant was received."""
         del self.arcs[arc.id]
         arc._take_back(new_instance(), "its time was over before this client learned of the grant", self._now())
         arc.booking = ""  # the booking's time is over too
@@ -487,8 +473,7 @@ class RequestStore:
         self._ask_again(arc)
 
     def open_requests(self) -> list[OpenRequest]:
-        """Return all requests as reported to a new leader. Expected requests have no place: they belong to this client
-        only if the RCs report them so, and are not queued otherwise."""
+        """All requests for a new leader. Expected ones have no place: without a report by RCs they are not queued."""
         now = self._now()
         expected = [msgspec.structs.replace(arc._open_request(now), place=None) for arc in self.expected.values()]
         return [*(arc._open_request(now) for arc in self.open), *expected]
@@ -502,7 +487,7 @@ class RequestStore:
         self.notify(arc)
 
     def go_back(self, term: Term) -> None:
-        """Forget all that came from leaders above `term`, to whose leader the client returns."""
+        """Forget all that came from leaders above `term`."""
         for arc in (*self.arcs.values(), *self.moved.values(), *self.expected.values()):
             arc._go_back(term)
 

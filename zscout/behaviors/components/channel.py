@@ -52,16 +52,14 @@ Operation: TypeAlias = (
 
 
 class Order(msgspec.Struct, frozen=True, tag="order"):
-    """An operation that the node received, unchanged. The process answers with an OrderAnswer of this `number`; a stop
-    and an activation have no answer, only the reports that follow."""
+    """An operation that the node received, unchanged. The process answers all but stops and activations, whose effect
+    it reports, with an OrderAnswer of this `number`."""
 
     number: int
     operation: Operation
 
 
 class PhaseReport(msgspec.Struct, frozen=True, tag="stands"):
-    """The component has reached this phase."""
-
     phase: Literal["standby", "running"]
     movable: bool
 
