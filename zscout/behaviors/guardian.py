@@ -161,13 +161,12 @@ def is_hidden() -> bool:
 
 
 def be_subreaper() -> None:
-    """Make this process the parent of its orphaned descendants."""
     ctypes.CDLL(None).prctl(PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
 
 
 class ControlGroup:
-    """A control group (v2) for the command, if this host permits: it kills all its processes at once, including
-    processes of other users and processes that fork faster than /proc can be searched."""
+    """A control group (v2), if this host permits: it kills all its processes at once, also other users' and ones that
+    fork faster than /proc is searched."""
 
     def __init__(self) -> None:
         self.folder: str | None = None
@@ -211,8 +210,6 @@ class ControlGroup:
 
 
 class Guardian:
-    """Guards the command's tree of processes until the last has ended."""
-
     def __init__(self, channel: socket.socket, grace: int) -> None:
         self._channel: socket.socket | None = channel
         self._ending = Ending(grace)
@@ -245,8 +242,6 @@ class Guardian:
     def reports_end(self) -> bool:
         """Return True if the client is gone or frozen, so that the guardian must report the end to the RCs."""
         return self._channel is None or self._why == "deadline"
-
-    # The start
 
     def _start(self, tty: int, command: list[str]) -> None:
         mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGCHLD, *END_SIGNALS})
@@ -282,7 +277,7 @@ class Guardian:
         self._send(f"started {self._leader}")
 
     def _become(self, guardian: int, tty: int, command: list[str], mask: set[int | signal.Signals]) -> None:
-        """Execute the command in the child. Raises OSError."""
+        """Raises OSError."""
         os.setpgid(0, 0)
         ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
         if os.getppid() != guardian:
@@ -301,8 +296,6 @@ class Guardian:
             os.close(tty)
         signal.pthread_sigmask(signal.SIG_SETMASK, mask)
         os.execvp(command[0], command)  # noqa: S606 - the purpose of this program
-
-    # Until the tree has ended
 
     def _watch(self) -> None:
         poll = select.poll()
@@ -331,7 +324,7 @@ class Guardian:
                         poll.unregister(listened)
 
     def _reap(self) -> bool:
-        """Wait for children that ended or were stopped, without blocking. Return False if none is left."""
+        """Return False if no child is left. Does not block."""
         while True:
             try:
                 pid, status = os.waitpid(-1, os.WNOHANG | os.WUNTRACED)
@@ -348,7 +341,6 @@ class Guardian:
                 self._send(f"exited {os.waitstatus_to_exitcode(status)}")
 
     def _terminate(self) -> None:
-        """Send SIGTERM, once, to all descendants."""
         self._terminated = True
         self._ending.begin(self._since or now())
         if self._why:
@@ -384,8 +376,7 @@ class Guardian:
                 os.kill(self._leader, number)
 
     def _to_group(self, number: int) -> bool:
-        """Signal the command's group while the command, or another child of the guardian, is in it; return success. An
-        empty group's number may be reused."""
+        """Signal the command's group while a child of the guardian is in it: an empty group's number may be reused."""
         with suppress(ChildProcessError, ProcessLookupError, PermissionError):
             if not self._leader:
                 os.waitid(os.P_PGID, self._command, os.WEXITED | os.WNOHANG | os.WNOWAIT)
@@ -394,14 +385,12 @@ class Guardian:
         return False
 
     def _begin_end(self, why: str, since: int = 0) -> None:
-        """End the tree; the first reason counts."""
+        """The first reason counts."""
         if not self._why:
             self._why, self._since = why, since or now()
 
     def _on_signal(self, *_: object) -> None:
         self._begin_end("signal")
-
-    # The channel
 
     def _send(self, words: str) -> None:
         if self._channel is not None:

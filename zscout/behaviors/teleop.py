@@ -98,7 +98,6 @@ class Pilot:
         """Last report of a stick: time, forward, right."""
 
     def press(self, now: float, way: Way) -> None:
-        """Take a press or repetition of a key that drives."""
         came, drives_until = self._ways.get(way, (-math.inf, now))
         # A repetition never shortens the time of the press.
         self._ways[way] = (now, max(drives_until, now + (NEXT if now - came <= REPEATS else FIRST)))
@@ -116,7 +115,7 @@ class Pilot:
         self._stick = None
 
     def faster(self, notches: int) -> None:
-        """Change the speed by `notches`; negative is slower."""
+        """Negative: slower."""
         self.speed = round(max(SLOWEST, min(1.0, self.speed + notches * NOTCH)), 2)
 
     def wheels(self, now: float) -> Wheels:
@@ -139,8 +138,6 @@ class Pilot:
 
 
 class Teleop:
-    """Takes, drives and gives back one robot for one operator."""
-
     def __init__(
         self,
         client: Client,
@@ -176,7 +173,7 @@ class Teleop:
         self.wake()
 
     def give_back(self) -> None:
-        """Give the robot back; a preempted holder gets it again."""
+        """A preempted holder gets it again."""
         self.pilot.stop()
         self._wanted.clear()
         self._unwanted.set()
@@ -219,7 +216,7 @@ class Teleop:
             self._set_state("waiting", arc.reason, arc.why)
 
     async def _while_wanted(self, work: Coroutine[Any, Any, None]) -> None:
-        """Do `work`; cancel it when the robot is given back."""
+        """Cancel `work` when the robot is given back."""
         tasks = [asyncio.create_task(work), asyncio.create_task(self._unwanted.wait())]
         try:
             await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)

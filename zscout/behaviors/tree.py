@@ -40,8 +40,6 @@ MAX_WORD: Final = 64
 
 @dataclass(frozen=True, slots=True)
 class BehaviorContext:
-    """The surroundings of a tree of behaviors."""
-
     client: Client
     safe_point: Callable[[], Awaitable[None]]
     """Await it wherever the state of the whole tree is consistent: the tree may then move to another host."""
@@ -113,8 +111,6 @@ class Behavior:
         if self._publish_status is not None:
             self._publish_status(BehaviorSaid(self.path, doing, detail, robot, camera, alert, list(boxes)))
 
-    # State that survives a move
-
     def memory(self) -> dict[str, Any]:
         """Return this behavior's state for JSON, without its children's."""
         return {}
@@ -123,7 +119,6 @@ class Behavior:
         """Restore the state that `memory` returned. Raises ValueError if it is invalid."""
 
     def checkpoint(self) -> dict[str, Any]:
-        """Return the memories of the whole tree."""
         return {"own": self.memory(), "children": {child.name: child.checkpoint() for child in self.children}}
 
     def restore(self, state: dict[str, Any]) -> None:

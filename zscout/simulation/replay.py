@@ -53,10 +53,9 @@ def replay(
     policy: SchedulingPolicy = DEFAULT,
     lasting: Mapping[ArcId, Ns] = MappingProxyType({}),
 ) -> Replay:
-    """Run the workload to its end. `watch` is called with the core after each batch. `lasting` is by ARC the time
-    (ns) after which its program releases its hold, if shorter than its minimum runtime.
-
-    Holds kept past their minimum runtime end when no other event is left."""
+    """Run the workload to its end. `watch` is called with the core after each batch. `lasting`: by ARC, when its
+    program releases its hold (ns), if before its minimum runtime. Holds kept beyond that end when no other event is
+    left."""
     core = Core(strategy, policy)
     capacity = {rc.name: rc.capacity for rc in workload.rcs if rc.sharable}
     runtime = {arrival.request.arc: arrival.request.min_runtime for arrival in workload.arrivals}

@@ -44,14 +44,11 @@ class Component:
 
 
 def is_movable(component: Component) -> bool:
-    """Return True if the class of `component` defines both `checkpoint` and `restore`."""
     kind = type(component)
     return kind.checkpoint is not Component.checkpoint and kind.restore is not Component.restore
 
 
 class ComponentContext:
-    """A component's surroundings: its client on the mesh, its name and its incarnation."""
-
     def __init__(self, client: Client, component: str, incarnation: int, gate: SafePointGate) -> None:
         self.client = client
         """A connected `zscout.Client`."""
@@ -62,8 +59,8 @@ class ComponentContext:
         self._gate = gate
 
     async def safe_point(self) -> None:
-        """Allow a checkpoint or a move at this point. Await it often, wherever the state is complete: it costs almost
-        no time. Until it returns, no other task of the component may change the state."""
+        """Allow a checkpoint or a move here. Await it often, wherever the state is complete: it costs almost no time.
+        Until it returns, no other task of the component may change the state."""
         await self._gate.enter()
 
 
@@ -81,7 +78,6 @@ class SafePointGate:
         self._waiting = 0
 
     async def enter(self) -> None:
-        """Wait while the gate is held."""
         await asyncio.sleep(0)
         while not self._open.is_set():
             self._waiting += 1
@@ -93,12 +89,11 @@ class SafePointGate:
 
     @property
     def holds(self) -> bool:
-        """Return True while a task waits in `enter`; a task that was cancelled there no longer counts."""
+        """A task that was cancelled in `enter` no longer counts."""
         return self._waiting > 0
 
     async def hold(self, patience: float) -> bool:
-        """Close the gate and wait until a task has entered. Return False, with the gate open again, if none has within
-        `patience` seconds."""
+        """Return False, with the gate open again, if no task has entered within `patience` seconds."""
         self._open.clear()
         try:
             async with asyncio.timeout(patience):
@@ -116,16 +111,13 @@ class SafePointGate:
         self._open.set()
 
 
-# Installed kinds: the entry points of GROUP
-
-
 class BadKind(Exception):
     """A component of this kind can't be made on this host; the message is one line."""
 
 
 def installed_kinds() -> dict[str, str]:
-    """Return `module:class` by name of kind. Reads the metadata of all packages, in some 10 ms. A kind that two
-    packages register with different classes is ambiguous, and left out."""
+    """`module:class` by name of kind, from the metadata of all packages (some 10 ms). A kind that two packages register
+    with different classes is left out."""
     found: dict[str, set[str]] = {}
     for entry in metadata.entry_points(group=GROUP):
         with suppress(BadName):
@@ -134,8 +126,7 @@ def installed_kinds() -> dict[str, str]:
 
 
 def load_kind(kind: str, where: str) -> type[Component]:
-    """Import the class of a kind from `where`, a value of `installed_kinds`. Raises BadKind, or any error of the
-    import."""
+    """Import a kind from `where`, a value of `installed_kinds`. Raises BadKind, or any error of the import."""
     module_name, _, attributes = where.partition(":")
     try:
         found: Any = importlib.import_module(module_name.strip())

@@ -48,8 +48,7 @@ class BadParams(BadKind):
 
 
 class ComponentLifecycle:
-    """Runs the component of `job`. `report` sends a report to the node; its future is done once it is sent. Tests
-    replace `connect`."""
+    """`report` sends a report to the node; its future is done once it is sent. Tests replace `connect`."""
 
     def __init__(
         self,
@@ -128,8 +127,8 @@ class ComponentLifecycle:
                 self._supervisor.spawn(self._answer_or_decline(order.number, self._restore, restore))
 
     def end(self, end_report: EndReport) -> None:
-        """End the component; the first of several ends is reported. A move under way is called off unless it is
-        committed, in which case the component continues in its new process."""
+        """End the component; the first end is reported. A move that is not committed is called off; after a committed
+        one the component continues in its new process."""
         if self._requested_end is not None:
             return
         self._requested_end = end_report
@@ -137,8 +136,6 @@ class ComponentLifecycle:
             self._move.called_off = "the component is being stopped"
         if self._main_task is not None and (self._move is None or not self._move.began):
             self._main_task.cancel()
-
-    # The main task
 
     async def _run_component(self) -> EndReport:
         job = self._job
@@ -215,8 +212,6 @@ class ComponentLifecycle:
             token.close()
         return self._requested_end or EndReport("completed")
 
-    # Orders that are answered
-
     async def _answer_or_decline(self, number: int, carry_out: Callable[..., Awaitable[None]], *what: Any) -> None:
         try:
             await carry_out(number, *what)
@@ -224,8 +219,7 @@ class ComponentLifecycle:
             await self._report(OrderAnswer(number, problem=Problem(refused.code, str(refused))))
 
     def _movable(self, *, standby: bool = False) -> tuple[Component, Client]:
-        """Return the component and its client. Raises NotMoved if it is neither running nor on standby, as `standby`
-        requires, or has no checkpoint() and restore()."""
+        """Raises NotMoved if it is not running (on standby, if `standby`), or has no checkpoint() and restore()."""
         component, client = self._component, self._client
         fits = self._job.start.standby and not self._running if standby else self._running
         if component is None or client is None or not fits:
@@ -319,7 +313,7 @@ class ComponentLifecycle:
 
 
 async def _wait_for_names(client: Client, role: str, names: list[Callable[[str], bool]], timeout: float) -> bool:
-    """Wait until each of `names` accepts the name of some token of this role; return False after `timeout` seconds."""
+    """Wait until each of `names` accepts some token's name of this role; return False after `timeout` seconds."""
     missing, found = list(names), asyncio.Event()
 
     def on_token(token: Token, alive: bool) -> None:
@@ -332,7 +326,7 @@ async def _wait_for_names(client: Client, role: str, names: list[Callable[[str],
 
 
 async def _wait_for_any(timeout: float, *events: asyncio.Event) -> bool:
-    """Wait until any of `events` is set; return False after `timeout` seconds."""
+    """Return False after `timeout` seconds."""
     waits = [asyncio.ensure_future(event.wait()) for event in events]
     try:
         done, _ = await asyncio.wait(waits, timeout=timeout, return_when=asyncio.FIRST_COMPLETED)
@@ -343,7 +337,6 @@ async def _wait_for_any(timeout: float, *events: asyncio.Event) -> bool:
 
 
 def _error_line(error: BaseException, *, named: bool = True) -> str:
-    """Return an error's message on one line, with its class name if `named`."""
     text = " ".join(str(error).split())[:MAX_ERROR]
     name = type(error).__name__
     return f"{name}: {text}" if text and named else text or name

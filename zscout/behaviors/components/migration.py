@@ -67,8 +67,8 @@ class OutgoingMove:
         """Set to a reason to call the move off, which works until it is committed."""
 
     async def carry_out(self) -> float:
-        """Return, once the successor runs, for how many seconds the component was paused. This process must then end
-        without giving back any hold. Raises NotMoved if the component continues here."""
+        """Return, once the successor runs, for how many seconds the component was paused; this process must then end,
+        with all holds left. Raises NotMoved if the component continues here."""
         await self._look_for_successor()
         if not await self._gate.hold(self._patience):
             raise NotMoved("not_safe", f"it reached no safe point within {self._patience:g} s")
@@ -141,8 +141,8 @@ class OutgoingMove:
         return await self._repeat_until_known(messages.ActivateComponent(self._name, self.incarnation))
 
     async def _stop_successor(self) -> bool:
-        """Stop the successor, unless it runs: then it has the ARCs. Called when the RCM's answer to the hand-over is
-        lost. Return True if the successor has run, False if it never will."""
+        """Stop the successor, unless it runs and has the ARCs: the RCM's answer was lost. Return True if it has run,
+        False if it never will."""
         reply = await self._ask(messages.ListComponents(self._name), messages.ComponentList, QUERY_TIMEOUT)
         if isinstance(reply, messages.ComponentList) and any(
             view.incarnation == self.incarnation and view.phase == "running" for view in reply.components
@@ -175,8 +175,8 @@ class OutgoingMove:
         return True
 
     async def _look_for_successor(self) -> bool:
-        """Return True if the successor's process may still live: its node or its client has a token. The process
-        outlives its node by moments only, and sends nothing once its client's token is gone."""
+        """Return True if the successor may live: its node or client has a token. It outlives its node by moments only,
+        and sends nothing without its client's token."""
         mesh = self._client.mesh
         looks = (mesh.living(mesh.keys.alive_any(role), timeout=LOOK_TIMEOUT) for role in (Role.NODE, Role.CLIENT))
         nodes, clients = await asyncio.gather(*looks)

@@ -25,8 +25,8 @@ MAX_ENVIRONMENT: Final = 4_000_000
 
 
 def kill_family(tag: str, *, spare: int = 0) -> int:
-    """Kill all processes with VARIABLE=`tag` in their environment, except the process `spare`. Return their number once
-    they are dead, or after DYING seconds. Processes of other users can't be seen."""
+    """Kill all processes with VARIABLE=`tag` in their environment, but `spare`. Return their number once they are dead,
+    or after DYING seconds. Other users' processes are not seen."""
     wanted = f"{VARIABLE}={tag}".encode()
     killed: dict[int, int] = {}
     try:
@@ -45,7 +45,7 @@ def kill_family(tag: str, *, spare: int = 0) -> int:
 
 
 def _names(folder: str) -> list[str]:
-    """Return the names in a folder; none if it can't be read."""
+    """None if it can't be read."""
     with suppress(OSError):
         return os.listdir(folder)  # noqa: PTH208
     return []
@@ -80,8 +80,8 @@ def _wait(handles: Iterable[int]) -> None:
 
 
 def limit_allocations(limit: int) -> None:
-    """Limit this process, and each that it starts, to `limit` bytes in use; allocations beyond that raise MemoryError.
-    0: no limit. For hosts that can't limit the processes of a component together."""
+    """Limit this process and each that it starts to `limit` bytes; more raises MemoryError. 0: no limit. For hosts that
+    can't limit a component's processes together."""
     if limit <= 0:
         return
     # RLIMIT_DATA also counts stacks and arenas that are reserved but unused, so leave those out.

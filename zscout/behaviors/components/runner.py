@@ -83,7 +83,7 @@ def _send(connection: socket.socket, frame: bytes) -> None:
 
 
 def _receive_orders(orders: BinaryIO, tag: str, deliver: Callable[[Order], object]) -> None:
-    """Deliver orders until the node closes, then kill all processes of this component, this one last. Runs in a thread,
+    """Deliver orders until the node closes, then kill all processes of this component, this one last. In a thread,
     since the component may block the event loop."""
     try:
         with suppress(BadFrame, RuntimeError):  # RuntimeError: the loop is closed

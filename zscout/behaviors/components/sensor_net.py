@@ -69,8 +69,8 @@ class RobotParams(SharedParams):
 
 
 class NetParams(SharedParams):
-    """Parameters of `place_sensor_net`. `wanted`: how many robots to place, by default all; the others replace lost
-    robots. `name`: name of its behavior and prefix of its components' names, so each net needs its own."""
+    """`wanted`: how many robots to place, by default all; the others replace lost ones. `name`: of its behavior and
+    prefix of its components' names, so each net needs its own."""
 
     robots: Annotated[
         tuple[str, ...], key("The robots to place.", most=MAX_ROBOTS, remedy='add a list, as in ["robot/scout33"]')
@@ -93,8 +93,8 @@ class NetParams(SharedParams):
 
 
 class TreeComponent(Component):
-    """A component that performs and checkpoints a tree of behaviors, `root`. It publishes their status, and prints each
-    change and each alert for `zscout component logs`."""
+    """Performs and checkpoints the tree `root`, publishes its status, and prints changes and alerts for `component
+    logs`."""
 
     root: Behavior
     speed: float

@@ -41,8 +41,6 @@ class CounterParams(Struct):
 
 
 class Counter(Component):
-    """Counts, and prints each count."""
-
     def __init__(self, params: dict[str, Any]) -> None:
         self.params = read_params(params, CounterParams)
         self.rc = None if self.params.rc is None else check_need(self.params.rc)
@@ -83,8 +81,7 @@ class Counter(Component):
 
 
 async def _echo(held: Held, rc: str, number: int) -> None:
-    """Repeat the command until it is answered: an echo may run twice, and the hold remains valid. Raises
-    CommandRefused."""
+    """Repeat the command until it is answered: an echo may run twice. Raises CommandRefused."""
     while True:
         try:
             await held.command(rc, {"name": "echo", "value": number})

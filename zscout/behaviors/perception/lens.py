@@ -44,5 +44,5 @@ def linear(picture: Picture) -> NDArray[np.float32]:
 
 
 def bearing(column: float) -> float:
-    """Radians to the left of the axis."""
+    """Radians to the left."""
     return -math.atan((column - MIDDLE) / FOCAL)

@@ -166,8 +166,8 @@ class _Near:
 
 class MotionDetector:
     def __init__(self, *, outlines: bool = False, limits: MotionLimits | None = None) -> None:
-        """With `outlines`, also report moving pixels, and fit boxes to them. `limits.min_duration` is ignored here:
-        give it to an EventTracker."""
+        """With `outlines`, also report moving pixels, and fit boxes to them. `limits.min_duration` is the
+        EventTracker's."""
         self._limits = limits or MotionLimits()
         self._ignored: Mask | None = None  # 255 where motion does not count; None without such regions
         self._smallest = max(SMALLEST, self._limits.min_area)
@@ -190,8 +190,8 @@ class MotionDetector:
         self._sightings: deque[tuple[float, NDArray[np.uint8], NDArray[np.uint8], _Plane]] = deque(maxlen=RECENT - 1)
 
     def see(self, time: float, picture: Picture) -> Seen:
-        """Analyse a picture of shape (height, width), or (height, width, 3) in BGR, made at `time` (seconds of any
-        clock). Raises ValueError for other arrays."""
+        """`picture`: (height, width), or (height, width, 3) in BGR, made at `time` (seconds of any clock). Raises
+        ValueError for other arrays."""
         passed = min(1.0, max(0.0, time - self._last))
         seen, regions = self._look(time, picture, passed)
         if self._outlines is None:
@@ -270,8 +270,7 @@ class MotionDetector:
         return noise < CLEARER * before or _off(away) > max(OTHER, OTHER_NOISE * noise)
 
     def pause(self) -> None:
-        """Prepare for a pause. The first pictures afterwards that fit the background continue it; until then nothing is
-        reported."""
+        """The first pictures after a pause that fit the background continue it; until then nothing is reported."""
         self._sightings.clear()
         self._presence.clear()
         self._near = None
@@ -339,8 +338,7 @@ class MotionDetector:
         return None if self._near is None else _with_rim(self._near.mask)
 
     def _score(self, away: _Plane) -> tuple[_Plane, float]:
-        """Return by how many standard deviations each pixel is off, smoothed, relative to the median; and the
-        median."""
+        """By how many standard deviations each pixel is off, smoothed, relative to the median; and the median."""
         # Neighbours have similar noise: their mean bounds one pixel's few samples from below.
         spread = np.sqrt(np.maximum(np.maximum(self._variance, cv2.blur(self._variance, (5, 5))), FLOOR**2))
         score = np.abs(cv2.GaussianBlur(away, (3, 3), 0)) / spread
@@ -391,7 +389,6 @@ class MotionDetector:
         return np.where(keep[labels], np.uint8(255), np.uint8(0)), stats[keep], stats[clear]
 
     def _stands_aside(self, level: _Plane, region: _Regions | list[int]) -> bool:
-        """Return True if a region's lines are torn."""
         top, high = region[cv2.CC_STAT_TOP], region[cv2.CC_STAT_HEIGHT]
         return _torn(level[top : top + high], self._mean[top : top + high])
 
@@ -411,8 +408,7 @@ class MotionDetector:
 
 
 def _moving(mask: NDArray[np.uint8], off: _Plane, noise: float) -> NDArray[np.uint8]:
-    """Return the regions without small ones that don't move, as a clock's digits; all regions if noise hides
-    changes."""
+    """Leave out small regions that don't move, as a clock's digits, unless noise hides changes."""
     if noise > QUIET:
         return mask
     count, labels, stats, _ = cv2.connectedComponentsWithStats(mask, connectivity=8)
@@ -431,7 +427,6 @@ def _around(mask: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 def _with_rim(mask: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Include the shadow and blur around motion."""
     return np.asarray(cv2.dilate(mask, np.ones((5, 5), np.uint8)), np.uint8)
 
 
@@ -475,10 +470,8 @@ def _levelled(
     last: tuple[float, float],
     ignored: NDArray[np.uint8] | None = None,
 ) -> tuple[_Plane, tuple[float, float]]:
-    """Return the picture, adjusted to the background's brightness and freed of bands of light, and its gain and offset.
-
-    Pixels where `hidden` or `ignored` is above 0 are not used to measure the light; `last` are gain and offset of the
-    picture before."""
+    """The picture at the background's brightness, without bands of light, and its gain and offset. `last`: those of the
+    picture before. Pixels with `hidden` or `ignored` above 0 don't measure the light."""
     gain, offset = _light(grey, mean, hidden, last, ignored)
     level = ((grey - np.float32(offset)) / np.float32(gain)).astype(np.float32)
     near = hidden
@@ -508,7 +501,6 @@ def _light(
     last: tuple[float, float],
     ignored: NDArray[np.uint8] | None,
 ) -> tuple[float, float]:
-    """Return the picture's gain and offset against the background."""
     rows = max(2, round(BLOCKS * grey.shape[0] / grey.shape[1]))
     now = cv2.resize(grey, (BLOCKS, rows), interpolation=cv2.INTER_AREA).ravel().astype(np.float64)
     was = cv2.resize(mean, (BLOCKS, rows), interpolation=cv2.INTER_AREA).ravel().astype(np.float64)
@@ -537,9 +529,8 @@ def _light(
 
 
 def _bands(grey: _Plane, mean: _Plane, gain: float, offset: float, hidden: NDArray[np.uint8] | None) -> _Plane | None:
-    """Return each line's gain if light rolls over the picture in bands, as mains lighting does; None without bands.
-
-    `gain` and `offset` are the best fit without bands; bands must halve its median error."""
+    """Each line's gain if light rolls over the picture in bands, as mains lighting does, else None. Bands must halve
+    the median error of the best fit without them, `gain` and `offset`."""
     stripes = STRIPES, grey.shape[0]
     now = np.asarray(cv2.resize(grey, stripes, interpolation=cv2.INTER_AREA), np.float32)
     was = np.asarray(cv2.resize(mean, stripes, interpolation=cv2.INTER_AREA), np.float32)
@@ -623,7 +614,6 @@ class EventTracker:
 
 
 def around(boxes: tuple[Box, ...]) -> Box:
-    """Return the box around all `boxes`; an empty box for none."""
     if not boxes:
         return Box(0, 0, 0, 0)
     left, top = min(box.x for box in boxes), min(box.y for box in boxes)

@@ -28,15 +28,14 @@ class Outlines:
         self._mean: NDArray[np.float32] = np.empty((0, 0), np.float32)
 
     def learn(self, picture: NDArray[np.uint8], share: float) -> None:
-        """Make the background follow the whole picture by `share`, 0 to 1."""
+        """`share`: 0 to 1."""
         if self._mean.shape != picture.shape:
             self._mean = picture.astype(np.float32)
         else:
             cv2.accumulateWeighted(picture, self._mean, share)
 
     def trace(self, picture: NDArray[np.uint8], regions: Mask, share: float) -> Mask:
-        """Return the moving pixels within `regions` of the reduced picture; elsewhere the background follows the
-        picture by `share`."""
+        """The moving pixels within `regions` of the reduced picture; elsewhere the background follows by `share`."""
         height, width = picture.shape[:2]
         if self._mean.shape != picture.shape or not regions.any():
             self.learn(picture, share)

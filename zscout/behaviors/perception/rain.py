@@ -33,8 +33,7 @@ class Rain:
         self._until = self._last = -math.inf
 
     def without_drops(self, time: float, regions: Regions, smallest: float) -> Regions:
-        """Return the regions that are no drops; all regions without rain. Relevant regions have at least `smallest`
-        pixels."""
+        """The regions that are no drops; all without rain. Relevant ones have at least `smallest` pixels."""
         before, self._before, self.drops = self._before, regions, None
         passed, self._last = time - self._last, time
         if OFTEN < passed < math.inf:

@@ -35,8 +35,6 @@ class RobotNeeds:
 
 
 class HeldRobot:
-    """Commands to the robot, at the rate that its ARC requested."""
-
     def __init__(self, held: Held, needs: RobotNeeds, *, video: str | None = None) -> None:
         self.held = held
         self.robot = held.rc(needs.robot)
@@ -55,8 +53,8 @@ class HeldRobot:
         return on == self._transmits
 
     async def drive(self, left: float, right: float, lasts: float) -> bool:
-        """Turn the wheels (-1 to 1 of top speed) for `lasts` seconds, or until the next command. Stops are sent at
-        once, by one command; others return False, unsent, if they come too early."""
+        """Turn the wheels (-1 to 1 of top speed) for `lasts` seconds. Stops are sent at once, by one command; others
+        return False, unsent, if they come too early."""
         if left == 0 and right == 0:
             self._still = self._still or await self._command({"name": "stop"})
             return self._still

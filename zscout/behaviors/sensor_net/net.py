@@ -85,7 +85,6 @@ class SensorNet:
         return self._lose(now, member, "its camera shows nothing") if doing == "lost" else []
 
     def failed(self, now: float, robot: str, why: str) -> list[Effect]:
-        """The robot's behavior can't be had."""
         member = self.members[robot]
         return self._lose(now, member, why) if member.standing == "active" else []
 

@@ -44,7 +44,7 @@ class CameraBlind(Exception): ...
 
 @dataclass(frozen=True, slots=True)
 class Slots:
-    """Priorities, and minimum runtimes in seconds, of its ARCs."""
+    """Minimum runtimes are in seconds."""
 
     hide_priority: int = 2
     watch_priority: int = 1
@@ -52,8 +52,8 @@ class Slots:
     watch: float = 30.0
 
     def of(self, task: Task, *, sooner: bool = False) -> tuple[int, float]:
-        """Priority and minimum runtime in seconds of a task's ARC. `sooner` shortens a watch a little, since shorter
-        requests are granted first, until another request has exhausted its patience."""
+        """Priority and minimum runtime (s) of a task's ARC. `sooner` shortens a watch a little: shorter requests go
+        first."""
         if task == "hide":
             return self.hide_priority, self.hide
         return self.watch_priority, self.watch * (SOONER if sooner else 1)
@@ -121,8 +121,7 @@ class RobotTask(Behavior):
         self.task, self.place = task, place
 
     async def run(self, context: BehaviorContext) -> None:
-        """Request all needs and work under the hold, again after a revocation. Raises CameraBlind, and request
-        errors."""
+        """Work under the hold, again after each revocation. Raises CameraBlind, and request errors."""
         place, scout = self.place, self.place.scout
         priority, slot = place.slots.of(self.task, sooner=scout.saw_somebody)
         came, place.came = place.came, None
@@ -243,8 +242,8 @@ def _arc_name(robot: str, task: str) -> str:
 
 
 def _left(client: Client, turn: OpenArc, slack: float) -> float:
-    """Seconds until the last estimated start of a turn; infinite without one, or if it is overdue by more than `slack`,
-    as an estimate is replaced but never withdrawn."""
+    """Seconds until the last estimated start; infinite without one, or if it is overdue by more than `slack`: estimates
+    are never withdrawn."""
     if turn.start is None:
         return math.inf
     left = (turn.start - client.mesh.now()) / SECOND

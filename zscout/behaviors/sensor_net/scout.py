@@ -76,12 +76,10 @@ class Alerts:
 
 
 class Blindness:
-    """Why a robot shows no picture, over its holds: the channel's fault, or its own.
-
-    A robot that transmits shows a picture within seconds. If none comes for `timeout`, the channel may be jammed, its
-    receiver dead, or the robot. So another channel is tried if there is one: a robot unseen on SUSPECTS in a row is
-    dead; once it is seen, the earlier channel was bad, and is avoided for a while. A channel without even snow has no
-    working receiver: its framegrabber gives up, the hold ends before `timeout`, and the robot is not to blame."""
+    """Why a robot shows no picture, over its holds: the channel's fault, or its own. Without one for `timeout`, the
+    channel may be jammed, its receiver dead, or the robot. So another channel is tried if there is one: a robot unseen
+    on SUSPECTS in a row is dead; once it is seen, the earlier channel was bad, and is avoided for a while. A channel
+    without even snow has no working receiver: the hold ends before `timeout`, and the robot is not to blame."""
 
     def __init__(self, timeout: float) -> None:
         self.timeout = timeout  # seconds without a picture, warm-up included
@@ -168,12 +166,10 @@ class Scout:
 
     @property
     def task(self) -> Task:
-        """The task for a hold that begins now."""
         return "watch" if self.hider.state == "hidden" else "hide"
 
     @property
     def saw_somebody(self) -> bool:
-        """Return True if a recent turn saw motion."""
         return any(self._turns)
 
     def held(self, now: float, *, goes_on: bool = False) -> None:
@@ -205,7 +201,6 @@ class Scout:
         self.alerts.rest()
 
     def limit(self, limits: MotionLimits | None) -> None:
-        """What of the motion in later pictures counts."""
         if limits != self._limits:
             self._limits, self._detector = limits, MotionDetector(limits=limits)
 

@@ -26,8 +26,6 @@ SOLID: Final = 0.999
 
 
 class Air:
-    """The receivers of a building."""
-
     def __init__(self, *, seed: int = 0) -> None:
         self._rng = np.random.default_rng((seed, 0xA1))
         self._rows = np.arange(ROWS, dtype=np.float32)[:, None]

@@ -51,13 +51,12 @@ class Body:
         return Pose(self.x, self.y, self.heading)
 
     def place(self, x: float, y: float, heading: float) -> None:
-        """Lift the robot and set it down there, wheels at rest."""
         self.x, self.y, self.heading = float(x), float(y), float(heading)
         self.speed_left = self.speed_right = 0.0
 
     def receive(self, packet: Packet, now: float) -> None:
-        """Receive a packet at `now`, the world's time in seconds. Ignores packets for other robots and repetitions
-        of the last packet, compared as a whole since senders may use the same numbers."""
+        """Receive a packet at `now`, the world's seconds. Packets for other robots and repetitions are ignored; these
+        are compared whole, since senders may use the same numbers."""
         if not self.alive or packet.robot != self.id or packet == self._last:
             return
         self._last = packet

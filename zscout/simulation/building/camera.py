@@ -51,8 +51,6 @@ def shaded_by(x: float, y: float, heading: float, body: Cylinder) -> slice | Non
 
 @dataclass(slots=True)
 class _View:
-    """The fixed scene from a pose."""
-
     seen: Geometry
     at_x: Floats  # place on the floor of each pixel below the horizon, m, shape (60, 160)
     at_y: Floats
@@ -107,7 +105,6 @@ class Camera:
         return _View(seen, x + depths * seen.ways[0], y + depths * seen.ways[1])
 
     def _paint(self, x: float, y: float, view: _View, floor: Floats, atlas: Floats, ambient: float) -> Floats:
-        """Paint the fixed scene with the light of floor, atlas and ceiling."""
         picture = np.empty((HEIGHT, WIDTH), np.float32)
         self._paint_floor(x, y, view, floor, picture)
         picture[:HORIZON] = 0.8 * ambient
@@ -127,7 +124,6 @@ class Camera:
         picture[HORIZON:] = light * (1 + fine * _GRAIN_FADE)
 
     def _shade(self, x: float, y: float, heading: float, view: _View, moving: list[Cylinder], picture: Floats) -> None:
-        """Paint the shadows of moving bodies on the floor."""
         floor = view.seen.surface[HORIZON:] == 0
         for body in moving:
             if (shaded := shaded_by(x, y, heading, body)) is None:
@@ -235,7 +231,6 @@ def _between(image: Floats, x: Floats, y: Floats, *, tiled: bool = False) -> Flo
 
 
 def _add_windows(plan: Plan, lit: Lit, atlas: Floats) -> None:
-    """Make the texels of windows bright."""
     for light in plan.lights:
         if light.kind != "window":
             continue

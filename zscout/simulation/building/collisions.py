@@ -55,8 +55,8 @@ class Obstacles:
     def push_out(
         self, x: float, y: float, radius: float, others: list[tuple[float, float, float]]
     ) -> tuple[float, float]:
-        """Push a circle out of each obstacle and of `others` (x, y, radius) in turn, and return its new place, which
-        may still overlap in a narrow corner (see `gap`)."""
+        """Push a circle out of each obstacle and of `others` (x, y, radius) in turn. In a narrow corner the new place
+        may still overlap (`gap`)."""
         for _ in range(_ROUNDS):
             before = (x, y)
             x, y = min(max(x, radius), self.width - radius), min(max(y, radius), self.depth - radius)

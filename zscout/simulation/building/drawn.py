@@ -64,8 +64,8 @@ COVERINGS: Final[tuple[Covering, ...]] = ("plain", "planks", "tiles", "carpet")
 
 
 def drawn_plan(seed: int, *, robots: int = 4) -> Plan:
-    """A room of 3.2 to 6.5 m a side, the same for the same arguments, with at least HIDES hiding places that robots
-    can reach from their starts. Raises ValueError if none of TRIES rooms has them."""
+    """A room of 3.2 to 6.5 m a side, reproducible, with at least HIDES hiding places that robots can reach. Raises
+    ValueError if none of TRIES rooms has them."""
     rng = np.random.default_rng((seed, 0xD7A))
     for _ in range(TRIES):
         plan = _room(rng, f"drawn-{seed}")
@@ -76,8 +76,7 @@ def drawn_plan(seed: int, *, robots: int = 4) -> Plan:
 
 
 def with_robots(plan: Plan, count: int, *, seed: int = 0) -> Plan:
-    """The same building with `count` robots, scout33, scout35 and so on, on open and lit floor. Raises ValueError
-    if they have no room."""
+    """Add `count` robots, scout33, scout35 and so on, on open and lit floor. Raises ValueError if they have no room."""
     bare = msgspec.structs.replace(plan, robots=())
     world, rng = World(bare), np.random.default_rng((seed, 0x5C0))
     robots: list[Robot] = []

@@ -133,7 +133,6 @@ def _disc(count: int) -> tuple[Floats, Floats]:
 
 
 def _floor_sky(boxes: Cuboids, cell: float, shape: tuple[int, int]) -> Floats:
-    """Share of the sky visible from each cell of the floor."""
     total = np.zeros(shape, np.float32)
     mask = np.empty(shape, np.uint8)
     corners = boxes.corners()
@@ -161,7 +160,7 @@ def _patches(plan: Plan, boxes: Cuboids) -> NDArray[np.int32]:
 
 
 def _face_points(plan: Plan, boxes: Cuboids, patches: NDArray[np.int32]) -> tuple[Floats, Floats]:
-    """Points on all faces and their normals, both of shape (points, 3), in the order of the patches."""
+    """Points on all faces and their normals, of shape (points, 3), in the order of the patches."""
     corners = boxes.corners()
     room = np.array([[0, 0], [plan.width, 0], [plan.width, plan.depth], [0, plan.depth]], np.float32)
     points, normals = [], []

@@ -22,8 +22,6 @@ MAX_RATE: Final = 60.0
 
 @dataclass(frozen=True, slots=True)
 class DeviceTables:
-    """The [[rc]] tables of a building's devices, in TOML."""
-
     radio: str
     robots: list[str]
     videos: list[str]
@@ -42,7 +40,7 @@ def device_tables(
     framegrabbers: int,
 ) -> DeviceTables:
     """A radio at serial `port`, `robots` (ids on the air by RC), a video channel for each of `urls`, and
-    `framegrabbers` receivers that tune in to any of them at `rate` frames a second; `bound`, `warm_up` in seconds."""
+    `framegrabbers` that tune in to any of them at `rate` frames a second; `bound`, `warm_up` in seconds."""
     videos = [video_name(number) for number, _ in enumerate(urls, 1)]
     channels = _inline({rc: str(number) for number, rc in enumerate(videos, 1)})
     sources = _inline({rc: _text(url) for rc, url in zip(videos, urls, strict=True)})
@@ -67,8 +65,7 @@ def framegrabber_name(number: int) -> str:  # from 1
 
 
 def node_file(served: Served, *, fleet: Path | None, framegrabbers: int) -> str:
-    """TOML with an RC for the radio, each robot, each video channel and `framegrabbers` receivers, in real time:
-    a building at double speed warms up its cameras in half the time."""
+    """All devices in real time: a building at double speed warms up its cameras in half the time."""
     speed = served.speed
     baud = min(max(served.radio.baud, MIN_BAUD), MAX_BAUD)
     devices = device_tables(

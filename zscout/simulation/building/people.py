@@ -17,7 +17,7 @@ _APART: Final = 0.09
 
 
 class Walker:
-    """A person over time, absent between walks."""
+    """Absent between walks."""
 
     def __init__(self, person: Person, rng: np.random.Generator) -> None:
         self._person, self._rng = person, rng

@@ -31,7 +31,7 @@ Covering = Literal["plain", "planks", "tiles", "carpet"]
 
 
 class Wall(Struct, frozen=True, forbid_unknown_fields=True):
-    """A partition between two points, up to the ceiling."""
+    """Up to the ceiling."""
 
     start: Point
     end: Point
@@ -39,10 +39,9 @@ class Wall(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Furniture(Struct, frozen=True, forbid_unknown_fields=True):
-    """A piece by its middle and its extent before it is turned about that.
-
-    `solid` and `shelf` touch the floor; a `table` is a slab on four legs, a `chair` also has a back, a `desk`
-    panels at its sides; `raised`, `sofa` and `bed` are bodies on short feet, `clearance` above the floor."""
+    """A piece by its middle and its extent before it is turned. `solid` and `shelf` touch the floor; a `table` is a
+    slab on four legs, a `chair` also has a back, a `desk` panels at its sides; `raised`, `sofa` and `bed` are bodies on
+    short feet, `clearance` above the floor."""
 
     name: str
     kind: Kind
@@ -69,9 +68,8 @@ class Rug(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Light(Struct, frozen=True, forbid_unknown_fields=True):
-    """A lamp that shines down from `z` (0: the ceiling), or a window in an outer wall.
-
-    A window is `width` along its wall by `depth` in height, `z` its middle; only windows follow the daylight."""
+    """A lamp that shines down from `z` (0: the ceiling), or a window in an outer wall, `width` along the wall by
+    `depth` in height, `z` its middle; only windows follow the daylight."""
 
     name: str
     x: Place

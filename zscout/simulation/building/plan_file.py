@@ -18,7 +18,7 @@ PORCH: Final = 1.0  # m beyond the outer walls, for paths that come in by a door
 
 
 def load_plan(path: Path) -> Plan:
-    """Read a building. Raises BadInput, which names file, key and remedy."""
+    """Raises BadInput, which names file, key and remedy."""
     plan = read_toml(path, Plan, max_bytes=MAX_BYTES)
     top = Where(str(path))
     check_plan(plan, top)

@@ -44,20 +44,18 @@ class Pace:
         self._free = float("-inf")
 
     def carry(self, now: float, size: int, *, waited: bool) -> float:
-        """The time at which `size` bytes read at `now` have passed. `waited`: they follow the previous bytes without
-        a gap, so that a late read (up to SLACK) costs the line no time."""
+        """When `size` bytes read at `now` have passed. `waited`: they follow the previous bytes without a gap, so that
+        a late read (up to SLACK) costs the line no time."""
         begin = self._free if waited and now - self._free <= SLACK else max(now, self._free)
         self._free = begin + size / self.rate
         return self._free
 
 
 class RadioLine:
-    """A radio at the end of a serial line. Use within an event loop, as a context manager or with `close`.
-
-    Bytes pass at `baud / 10 * speed` per second; `speed` is the building's. A packet is lost with probability `loss`,
-    a byte garbled with `garble`; both repeat with `seed`. `link` is a stable name for the port: a symlink, which
-    replaces a symlink to another pty and is removed at the end; raises BadInput for anything else there. Drivers that
-    set a usual rate other than `baud` and `baud * speed` are received as noise. `on_packet(packet, at)` is called in
+    """A radio at the end of a serial line, within an event loop. Bytes pass at `baud / 10 * speed` per second; `speed`
+    is the building's. A packet is lost with probability `loss`, a byte garbled with `garble`; both repeat with `seed`.
+    `link`: a symlink to the port, which replaces one to another pty; raises BadInput for anything else there. Drivers
+    with a usual rate other than `baud` and `baud * speed` are received as noise. `on_packet(packet, at)` is called in
     the event loop; `at` is on its clock, in seconds."""
 
     def __init__(
@@ -144,13 +142,11 @@ class RadioLine:
         self.close()
 
     def _arrived(self) -> None:
-        """Handle the first bytes on an idle line."""
         if self._ends is not None:
             asyncio.get_running_loop().remove_reader(self._ends[0])
             self._take(waited=False)
 
     def _take(self, *, waited: bool) -> None:
-        """Put the next bytes on the line, or let it idle."""
         if self._ends is None:
             return
         loop, (master, slave) = asyncio.get_running_loop(), self._ends
@@ -176,7 +172,6 @@ class RadioLine:
         self._take(waited=True)
 
     def _hold_back(self, master: int, slave: int) -> None:
-        """Stop the writer while HOLDS bytes wait."""
         (waiting,) = struct.unpack("i", fcntl.ioctl(master, termios.FIONREAD, bytes(4)))
         if (waiting >= HOLDS) != self._stopped:
             self._stopped = not self._stopped
@@ -222,6 +217,5 @@ def _point(link: Path, port: str) -> None:
 
 
 def _unpoint(link: Path, port: str) -> None:
-    """Remove `link` if it still leads to `port`."""
     if link.is_symlink() and str(link.readlink()) == port:
         link.unlink(missing_ok=True)

@@ -40,11 +40,9 @@ T = TypeVar("T")
 
 
 class Served:
-    """A plan in motion that looks like a real building to drivers. Use as an async context manager.
-
-    `speed` is its seconds per second of real time; `frame_rate` (frames a second) and `baud` (of the radio's line)
-    are in the building's seconds. `loss` is the share of radio packets that no robot receives. `http` is host and
-    port (0: any free port) of the video, `radio_link` a name for the radio's port, `channels` the number of video
+    """A plan in motion that looks like a real building to drivers. `speed`: its seconds per second of real time;
+    `frame_rate` (frames a second) and `baud` (of the radio's line) are in its seconds. `loss`: share of radio packets
+    that no robot receives. `http`: host and port (0: any free port) of the video; `channels`: number of video
     receivers. Entering raises BadInput for a resource that is not available."""
 
     def __init__(
@@ -111,14 +109,13 @@ class Served:
         return self.clock.true_speed(asyncio.get_running_loop().time())
 
     def unplug_radio(self) -> None:
-        """Pull the radio's cable."""
         self.radio.unplug()
 
     def plug_radio(self) -> None:
         self.radio.plug()
 
     def kill(self, robot: str) -> None:
-        """Empty a robot's battery. Raises KeyError for an unknown robot."""
+        """Raises KeyError for an unknown robot."""
         self.world.bodies[robot].alive = False
 
     def stall(self, channel: int, *, stalled: bool = True) -> None:
@@ -126,11 +123,9 @@ class Served:
         self.video.stall(channel_name(channel), stalled=stalled)
 
     async def poses(self) -> BuildingPoses:
-        """Current positions."""
         return await self.in_world(lambda: poses(self.world, self.speed))
 
     async def map(self) -> BuildingPlan:
-        """The building from above."""
         return await asyncio.to_thread(building_plan, self.plan)
 
     async def in_world(self, work: Callable[[], T]) -> T:
@@ -138,7 +133,7 @@ class Served:
         return await asyncio.get_running_loop().run_in_executor(self._worker, work)
 
     async def until(self, time: float) -> None:
-        """Wait until the building's time is `time`, in seconds. Raises errors of the building."""
+        """`time` is in seconds. Raises errors of the building."""
         while self.time < time:
             wait = max(STEP, time - self.time) / self.speed
             done, _ = await asyncio.wait({self._running}, timeout=min(wait, 60.0))
@@ -196,5 +191,4 @@ class Served:
 
 
 def channel_name(number: int) -> str:
-    """Path segment of a video channel: ch1 for channel 1."""
     return f"ch{number}"

@@ -38,10 +38,9 @@ async def simulate(
     as_json: bool,
     **of_served: Any,
 ) -> None:
-    """Serve a building (`of_served`: arguments of `Served`) for `seconds` of its time, or without end.
-
-    `mesh_of`: publish positions on that fleet's mesh. `node`: write a node file there with all devices, in the fleet
-    of `fleet_file`. Raises BadInput, MeshError."""
+    """Serve a building (`of_served`: arguments of `Served`) for `seconds` of its time, or without end. `mesh_of`:
+    publish positions there. `node`: write a node file there with all devices, in the fleet of `fleet_file`. Raises
+    BadInput, MeshError."""
     served = Served(plan, **of_served)
     async with AsyncExitStack() as stack:
         publishing: asyncio.Task[None] | None = None
@@ -91,7 +90,6 @@ def _write_node(path: Path, text: str) -> None:
 
 
 async def _publish(served: Served, mesh: Mesh) -> None:
-    """Publish positions and answer queries for the plan until cancelled."""
     plan = await served.map()
 
     def answer(request: IncomingQuery[PlanAsk]) -> None:
@@ -113,7 +111,6 @@ async def _publish(served: Served, mesh: Mesh) -> None:
 
 
 def _access(served: Served) -> dict[str, Any]:
-    """The addresses of all devices, for `--json`."""
     link = served.radio.link
     return {
         "building": served.plan.name,
@@ -147,7 +144,6 @@ def _print(access: dict[str, Any]) -> None:
 
 
 def _line(served: Served, rate: float | None = None, cpu: float | None = None) -> str:
-    """The building's state as a line."""
     radio = served.radio
     slipped = served.clock.slipped
     words = (
@@ -164,7 +160,6 @@ def _line(served: Served, rate: float | None = None, cpu: float | None = None) -
 
 @contextmanager
 def _live(served: Served) -> Iterator[None]:
-    """Keep a live line at the terminal within the context."""
     from rich.text import Text
 
     process, loop = psutil.Process(), asyncio.get_running_loop()

@@ -60,7 +60,6 @@ class Cuboids:
 
 
 def cuboids_of(plan: Plan) -> Cuboids:
-    """All inner walls, then all furniture of a plan."""
     found = [_partition(wall, plan.height, plan.wall_shade) for wall in plan.walls]
     for piece in plan.furniture:
         found += parts(piece)

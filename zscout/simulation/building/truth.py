@@ -55,8 +55,8 @@ class Truth:
         return float(low * (1 - v) + high * v)
 
     def faces_light(self, x: float, y: float, heading: float) -> bool:
-        """Return True if a camera at (x, y) faces the lit part: at least FACING of the columns of its view show
-        floor within 4 m that has BRIGHTER times the light of its own place and half of the open floor's median."""
+        """Return True if at least FACING of the columns from (x, y) show floor within 4 m that has BRIGHTER times the
+        light of this place and half of the open floor's median."""
         here = self.floor_light(x, y)
         wanted = max(BRIGHTER * here, 0.5 * self.median_light)
         angle = heading + np.linspace(-VIEW / 2, VIEW / 2, _COLUMNS)

@@ -54,8 +54,8 @@ class StreamClient:
 
 
 class VideoServer:
-    """Serves `channels` (each a path segment). `port` 0 is any free port. Entering raises BadInput for an address
-    that can't be used."""
+    """`channels`: path segments. `port` 0: any free port. Entering raises BadInput for an address that can't be
+    used."""
 
     def __init__(self, channels: Sequence[str], *, host: str = "127.0.0.1", port: int = 0) -> None:
         self._channels = {name: Channel(name) for name in channels}
@@ -104,14 +104,13 @@ class VideoServer:
         return tuple(name for name, channel in self._channels.items() if channel.watchers and not channel.stalled)
 
     def show(self, channel: str, jpeg: bytes) -> None:
-        """Send a channel's newest frame."""
         shown = self._channels[channel]
         shown.frame, shown.number = jpeg, shown.number + 1
         for watcher in shown.watchers:
             watcher.news.set()
 
     def stall(self, channel: str, *, stalled: bool = True) -> None:
-        """Stop the frames of a channel with its connections open, or resume them."""
+        """Stop the frames with connections open, or resume them."""
         self._channels[channel].stalled = stalled
 
     async def _connected(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:

@@ -66,7 +66,6 @@ def plan_picture(plan: Plan, scale: float = SCALE) -> bytes:
 
 
 def poses(world: World, speed: float = 1.0) -> BuildingPoses:
-    """Current positions."""
     robots = [
         Placed(
             name=name[:64],

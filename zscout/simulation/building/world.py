@@ -154,7 +154,6 @@ class World:
         return self.floor_light(body.x, body.y) < self.median_light * DARK
 
     def faces_light(self, robot: str) -> bool:
-        """Return True if the camera looks at the lit part of the room (see `Truth.faces_light`)."""
         return self.truth.faces_light(*self.bodies[robot].pose)
 
     def people_in_view(self, robot: str, pose: Pose | None = None) -> int:
@@ -180,7 +179,6 @@ class World:
         return self.people_in_view(robot) >= least
 
     def clear(self, x: float, y: float) -> bool:
-        """Return True if a robot at (x, y) would touch no wall, furniture, robot or foot."""
         circles = [(body.x, body.y, RADIUS) for body in self.bodies.values()]
         circles += [foot for walker in self.walkers for foot in walker.feet()]
         return self.obstacles.gap(x, y) >= RADIUS and all(
@@ -188,7 +186,7 @@ class World:
         )
 
     def random_start(self, rng: np.random.Generator) -> Pose:
-        """A pose on open, lit and clear floor, any heading."""
+        """On open, lit and clear floor, any heading."""
         for _ in range(10_000):
             x, y = self.truth.random_open(rng)
             if self.clear(x, y):

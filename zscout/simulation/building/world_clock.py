@@ -11,9 +11,8 @@ WINDOW: Final = 2.0  # s of real time over which the true speed is measured
 
 
 class WorldClock:
-    """The times of steps, at `speed` seconds of the building per second of real time, `now` on any steady clock.
-
-    If the process runs too little, MAX_BEHIND is caught up, and the rest is lost and added to `slipped`."""
+    """The times of steps, at `speed` seconds of the building per real second, `now` on any steady clock. If the process
+    runs too little, MAX_BEHIND is caught up; the rest is lost and added to `slipped`."""
 
     def __init__(self, speed: float, now: float) -> None:
         self.speed = speed

@@ -35,8 +35,6 @@ SHOWN: Final = 2  # reports of each host while all components work
 
 @dataclass(slots=True)
 class PlacementTrial:
-    """Three Place Sensor Nets under a policy, and the observations."""
-
     policy: Policy
     gap: float  # s between the starts of two nets; 0: all at once
     placed: dict[str, str] = field(default_factory=dict)
@@ -100,7 +98,6 @@ class PlacementDemo(DemoRunner):
             await asyncio.sleep(0.1)
 
     async def _all_reported(self) -> None:
-        """Wait until all components were reported, then for SHOWN more reports of each host."""
         while sum(map(len, self._running.values())) < len(self.trial.placed):
             self._reported.clear()
             await self._reported.wait()

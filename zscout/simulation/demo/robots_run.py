@@ -60,7 +60,6 @@ class RobotsObserved:
     simulated: float = 0.0  # s of the building
 
     def summary(self) -> dict[str, Any]:
-        """The result for `--json`."""
         waits = sorted(self.waits)
         return {
             "robots": len(self.robots),
@@ -82,7 +81,7 @@ class RobotsObserved:
 
 
 class RobotsDemo(DemoRunner):
-    """The whole demo; `zero` is the start of the net."""
+    """`zero` is the start of the net."""
 
     def __init__(
         self,
@@ -108,7 +107,6 @@ class RobotsDemo(DemoRunner):
         self._returned_at: Ns | None = None
 
     async def play(self) -> None:
-        """Place the net, take over a robot, and watch the net."""
         client = await self._start()
         spec = ComponentSpec("place_sensor_net", {"robots": self.robots, "speed": self.speed})
         self.zero = clock.now()
@@ -145,7 +143,6 @@ class RobotsDemo(DemoRunner):
                     await self._news.wait()
 
     async def _operator(self, client: Client) -> None:
-        """Take a robot midway, drive it and give it back."""
         await asyncio.sleep(TAKEOVER / self.speed)
         robot = next((name for name in self.robots if self.seen.doing.get(name) not in (None, "wait")), self.robots[0])
         pilot = Pilot(0.5)
@@ -173,7 +170,6 @@ class RobotsDemo(DemoRunner):
             await asyncio.gather(driving, return_exceptions=True)
 
     async def _start(self) -> Client:
-        """Start the building and the nodes, and wait until all are present."""
         self.write_fleet()
         port = free_port("127.0.0.1", 0)
         line = self.folder / "radio0"
@@ -197,8 +193,7 @@ class RobotsDemo(DemoRunner):
         return client
 
     def _devices(self, port: int, line: Path) -> dict[str, str]:
-        """TOML of the devices by host: radio and channels on the first, robots on the second, framegrabbers on
-        first and third."""
+        """Radio and channels are on the first host, robots on the second, framegrabbers on first and third."""
         tables = device_tables(
             port=str(line),
             baud=BAUD,

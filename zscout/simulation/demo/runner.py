@@ -31,10 +31,8 @@ SHOWN: Final = 600  # characters of a log in a failure's message
 
 
 class DemoRunner(ABC):
-    """A run of a demo, implemented by `play`. Use as an async context manager, which leaves no process behind.
-
-    `show(at, text)` receives each event in words, `at` in seconds since `zero`; `on_live` the address of the live view,
-    before anything is shown."""
+    """A run of a demo; an async context manager, which leaves no process behind. `show(at, text)` receives each event,
+    `at` in seconds since `zero`; `on_live` the address of the live view, before anything is shown."""
 
     def __init__(
         self, folder: Path, show: Callable[[float, str], None], on_live: Callable[[str], Awaitable[None]] | None = None
@@ -54,14 +52,14 @@ class DemoRunner(ABC):
 
     @abstractmethod
     async def play(self) -> None:
-        """Start the demo's processes and play it to its end. Raises DemoFailed, MeshError, BadInput."""
+        """Raises DemoFailed, MeshError, BadInput."""
 
     @abstractmethod
     async def close(self) -> None:
         """Leave the mesh, before the processes end."""
 
     async def run(self) -> None:
-        """Play the demo. Raises as `play` does, and DemoFailed as soon as a process ends unexpectedly."""
+        """Raises as `play` does, and DemoFailed as soon as a process ends unexpectedly."""
         task = asyncio.ensure_future(self.play())
         try:
             await asyncio.wait({task, self._failed}, return_when=asyncio.FIRST_COMPLETED)
@@ -73,7 +71,6 @@ class DemoRunner(ABC):
             await asyncio.gather(task, return_exceptions=True)
 
     def event(self, text: str, at: Ns | None = None) -> None:
-        """Show an event; `at` defaults to now."""
         self._show(self.elapsed(at), text)
 
     def elapsed(self, at: Ns | None = None) -> float:
@@ -96,8 +93,8 @@ class DemoRunner(ABC):
         )
 
     async def start_nodes(self, extra: Mapping[str, str], node_table: str = "") -> None:
-        """Start a node for each of HOSTS, on loopback. `extra` is more text for a host's node file, `node_table`
-        more lines of its [node] table."""
+        """A node for each of HOSTS, on loopback. `extra`: text for a host's node file, `node_table` for its [node]
+        table."""
         if not self._ends:
             self.write_fleet()
         for host, end in self._ends.items():
@@ -143,7 +140,6 @@ class DemoRunner(ABC):
         return process
 
     def spawn(self, work: Coroutine[Any, Any, None]) -> None:
-        """Run `work` beside the demo; the demo fails with it."""
         self._supervisor.spawn(work)
 
     async def all_there(self, mesh: Mesh, *others: str) -> None:
@@ -205,8 +201,7 @@ class DemoRunner(ABC):
         self._failed.cancel()
 
     async def _end(self) -> None:
-        """End the recording node first, so that the end of the others is not recorded, and the building of their
-        devices last, since it does not end with its input."""
+        """End the recording node first, so that other ends are not recorded, and the building last, for its devices."""
         for process in self._processes.values():
             if process.stdin is not None:
                 process.stdin.close()
@@ -228,7 +223,6 @@ def _list(texts: Sequence[str]) -> str:
 
 
 def free_ports(count: int) -> list[int]:
-    """Different ports of loopback that are free at this moment."""
     ports: set[int] = set()
     while len(ports) < count:
         ports.add(free_port("127.0.0.1", 0))

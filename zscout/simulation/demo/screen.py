@@ -36,8 +36,6 @@ class LiveView(Protocol):
 
 
 class DemoScreen:
-    """Events as lines in a pipe, as a picture with the latest at a terminal, or not at all with `--json`."""
-
     def __init__(self, name: str, *, as_json: bool, decimals: int, live: LiveView | None = None) -> None:
         self._name, self._live, self._where = name, live, ""
         self._as_json, self._decimals = as_json, decimals
@@ -66,8 +64,8 @@ class DemoScreen:
         return [*([Text(self._where, overflow="fold")] if self._where else []), *lines]
 
     async def play(self, make: Callable[[Path], D], draw: Callable[[D], Group], out: Path | None) -> tuple[D, Path]:
-        """Run the demo that `make` returns for a temporary folder. Returns it and its recording, which is kept
-        even if the demo fails. `draw` returns the current picture."""
+        """Run the demo that `make` returns for a temporary folder. Returns it and its recording, which is kept even if
+        the demo fails."""
         with _recording(out) as path, tempfile.TemporaryDirectory(prefix="zscout-demo-") as folder:
             demo = make(Path(folder))
             try:
@@ -122,7 +120,7 @@ def _recording(out: Path | None) -> Iterator[Path]:
 
 
 def keep_recording(folder: Path, path: Path) -> bool:
-    """Move the recording out of the demo's folder; returns False if there is none."""
+    """Return False if there is none."""
     recorded = next((folder / RECORDINGS).glob("*.rrd"), None)
     if recorded is not None:
         shutil.move(recorded, path)

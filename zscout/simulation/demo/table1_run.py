@@ -103,7 +103,6 @@ class Table1Demo(DemoRunner):
             await self._mesh.close()
 
     async def _signal(self, arc: str) -> None:
-        """Make the ARC's process request it, and wait for the answer."""
         stdin = self._behaviors[arc].stdin
         assert stdin is not None  # noqa: S101
         stdin.write(b"\n")

@@ -25,8 +25,6 @@ class Paper(NamedTuple):
 
 
 class Difference(NamedTuple):
-    """A cell that differs from Table 2."""
-
     rc: str
     second: int
     paper: str
@@ -76,7 +74,6 @@ class Observed:
 
     @property
     def free(self) -> bool:
-        """Return True if the RCM published no holder."""
         return all(not changes[-1][1] for changes in self.changes.values())
 
     def same_order(self, expected: Table) -> bool:

@@ -40,8 +40,7 @@ class Turn(NamedTuple):
 
 
 def strip_and_tones(picture: Picture) -> tuple[Strip, Tones]:
-    """Return the strip for `turned`, as integers that a checkpoint keeps exactly, and the plain tones for
-    `brighter`."""
+    """The strip for `turned`, of integers that a checkpoint keeps exactly, and the plain tones for `brighter`."""
     by_angle = _by_angle(picture[_TOP:_BOTTOM])
     return _off_the_mean(by_angle, (_SLOW, 1)), np.rint(by_angle).astype(np.uint8)
 
@@ -61,8 +60,7 @@ def brighter(old: Tones, new: Tones, angle: float) -> float:
 
 
 def floor_strip(picture: Picture) -> Strip:
-    """Return a strip of the near floor's texture. It stays the same only if the robot turns on the spot or pushes
-    against something without moving."""
+    """A strip of the near floor's texture: the same only if the robot turns on the spot or pushes without moving."""
     return _off_the_mean(cv2.blur(_by_angle(picture[_NEAR:]), (3, 1)), (25, 7))
 
 
@@ -77,9 +75,8 @@ def _off_the_mean(levels: NDArray[Any], around: tuple[int, int]) -> Strip:
 
 
 def turned(old: Strip, new: Strip, expected: float = 0.0, spread: float = math.radians(40)) -> Turn:
-    """Return the turn that best maps `old` to `new`, in whole columns (0.4 degrees).
-
-    The search prefers `expected` (radians): `spread` away, a turn must correlate better by 0.15."""
+    """Return the turn that best maps `old` to `new`, in whole columns (0.4 degrees). `expected` (radians) is preferred:
+    `spread` away, a turn must correlate better by 0.15."""
     after, before = new.astype(np.float32), old.astype(np.float32)
     fast, slow = (np.fft.rfft(strip, 2 * COLUMNS, axis=1) for strip in (after, before))
     common = np.fft.irfft((fast * np.conj(slow)).sum(axis=0), 2 * COLUMNS)

@@ -62,8 +62,8 @@ class Hider:
         return self._robot.word
 
     def see(self, now: float, picture: Picture | None, defect: str | None = "") -> WheelCommand:
-        """The next command. `now`: seconds of any running clock; `picture`: shape (120, 160), None if not new;
-        `defect`: result of `garbled`, if known. Raises ValueError for other shapes."""
+        """`now`: seconds of any running clock; `picture`: shape (120, 160), None if not new; `defect`: of `garbled`, if
+        known. Raises ValueError for other shapes."""
         if picture is not None and (picture.shape != (ROWS, COLUMNS) or picture.dtype != np.uint8):
             raise ValueError(f"a picture is uint8 of shape (120, 160), not {picture.dtype} of {picture.shape}")
         robot = self._robot
@@ -109,7 +109,6 @@ class Hider:
         PHASES[phase].begin(self._robot)
 
     def _passed(self, now: float) -> float:
-        """Seconds since the last call."""
         robot = self._robot
         last = robot.last_now if robot.last_now is not None else now
         passed = min(LONGEST_GAP, max(0.0, now - last))

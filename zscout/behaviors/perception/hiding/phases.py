@@ -157,7 +157,6 @@ def stuck(robot: HidingState, _: View) -> Step:
 
 
 def back(robot: HidingState, _: View) -> Step:
-    """Back off, then turn aside."""
     if robot.hops == 0:
         robot.bumps += 1
         return robot.step_straight(-0.14, f"{robot.note or 'bumped'}: backs off")
@@ -168,7 +167,6 @@ def back(robot: HidingState, _: View) -> Step:
 
 
 def dodge(robot: HidingState, view: View) -> Step:
-    """Turn aside and look around again."""
     target = robot.target
     if robot.hops == 0:
         robot.goal = side_of(robot, view) * math.radians(40 + 20 * robot.roll())
@@ -203,7 +201,6 @@ def leave(robot: HidingState, _: View) -> Step:
 
 
 def approach(robot: HidingState, view: View) -> Step:
-    """Drive towards the place, correcting the course at every picture."""
     target = robot.target
     if target is None:
         return "scan"
@@ -266,7 +263,6 @@ def begin_enter(robot: HidingState) -> None:
 
 
 def enter(robot: HidingState, view: View) -> Step:
-    """Drive straight into the dark, by a few lengths of the body."""
     if robot.cruised(robot.left_to_go):
         return enter_stuck(robot, view)
     return robot.cruise(robot.pace, 0.0, "drives in")
@@ -295,15 +291,13 @@ def face(robot: HidingState, view: View) -> Step:
 
 
 def to_light(robot: HidingState) -> Step:
-    """Turn to the lightest side of the full turn just made."""
     robot.goal, robot.next_phase = lightest(robot.openings).heading, "settle"
     robot.note = "turns to the light"
     return "aim"
 
 
 def shelter(openings: list[Opening]) -> tuple[float, bool]:
-    """Return the ratio of near to lit floor over a full turn, and True if the top is dark on most sides, as beneath a
-    sofa."""
+    """The ratio of near to lit floor over a full turn; True if the top is dark on most sides, as beneath a sofa."""
     lit = max(side.outside for side in openings)
     near, above = np.percentile([(side.near, side.above) for side in openings], 75, axis=0).tolist()
     return near / max(lit, 1e-4), above <= ROOFED * lit

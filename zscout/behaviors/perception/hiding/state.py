@@ -192,7 +192,6 @@ class HidingState(msgspec.Struct):
 
     @property
     def here_for(self) -> float:
-        """Seconds in this phase."""
         return self.clock - self.began
 
     def roll(self) -> float:
@@ -204,7 +203,6 @@ class HidingState(msgspec.Struct):
         return float((mixed ^ (mixed >> 31)) >> 11) / float(1 << 53)
 
     def point(self, heading: float, distance: float) -> tuple[float, float]:
-        """The place at this heading and distance."""
         return self.x + distance * math.cos(heading), self.y + distance * math.sin(heading)
 
     def hop(self, angle: float, why: str) -> WheelCommand:
@@ -293,7 +291,6 @@ class HidingState(msgspec.Struct):
         return self.halted >= 2
 
     def sight(self, view: View) -> None:
-        """Add this picture to the scan's findings."""
         for place in view.places:
             heading = self.heading + place.bearing
             x, y = self.point(heading, place.distance)
@@ -302,9 +299,7 @@ class HidingState(msgspec.Struct):
         self.openings.append(self.opening(view))
 
     def opening(self, view: View) -> Opening:
-        """The direction of this picture.
-
-        Farther views have more structure around the horizon: 2 grey levels up to 0.7 m, 5 at 1 m, 8 beyond 1.5 m
+        """Farther views have more structure around the horizon: 2 grey levels up to 0.7 m, 5 at 1 m, 8 beyond 1.5 m
         (simulated)."""
         middle = unpack(self.previous)[9:15, COLUMNS // 4 : -COLUMNS // 4].astype(np.float32)
         return Opening(
@@ -318,17 +313,14 @@ class HidingState(msgspec.Struct):
         )
 
     def note_bad(self, x: float, y: float) -> None:
-        """Avoid this place from now on."""
         self.bad = [*self.bad, Spot(x, y)][-MAX_BAD:]
 
 
 def distance(place: Spot | Sighting | HidingState, other: Spot | Sighting | HidingState) -> float:
-    """Metres between two places."""
     return math.hypot(place.x - other.x, place.y - other.y)
 
 
 def wrapped(angle: float) -> float:
-    """The same angle within -pi to pi."""
     return math.remainder(angle, math.tau)
 
 
