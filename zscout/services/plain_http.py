@@ -25,8 +25,6 @@ _HOST: Final = re.compile(rb"\r\nhost:[ \t]*([^\r\n]*?)[ \t]*(?=\r\n)", re.IGNOR
 
 
 class Page(NamedTuple):
-    """An answer."""
-
     text: bytes
     kind: str = "text/plain"
     status: str = "200 OK"

@@ -129,7 +129,6 @@ def _offset(at: datetime, zone: ZoneInfo) -> timedelta:
 
 
 def _changes(zone: ZoneInfo, begins: datetime, ends: datetime) -> Iterator[datetime]:
-    """The instants at which the zone's offset changes."""
     day = timedelta(days=1)
     while begins < ends:
         low, high = begins, begins + day
@@ -182,7 +181,7 @@ def _repeated(fleet: str, view: BookingView, zone: ZoneInfo) -> list[Event]:
 
 
 def _event(fleet: str, view: BookingView, start: Instant | datetime, date: BookedDate | None = None) -> Event:
-    """The event of one date, or of the first of many, with the details of `date`."""
+    """`date`: its details, of the first of many."""
     event = Event()
     whole = view.every and not isinstance(start, datetime) and _zone(view) is None
     event.add("UID", f"{view.id}{f'-{start}' if whole else ''}@{fleet}")

@@ -92,7 +92,6 @@ def _repeated(booking: BookingRecord, after: float) -> Iterator[Instant]:
 
 
 def in_zone(time: float, zone: str) -> str:
-    """Format an instant for people in `zone`."""
     with suppress(ValueError, OverflowError):
         return datetime.fromtimestamp(time, zone_of(zone)).strftime("%Y-%m-%d %H:%M:%S %Z")
     return f"{time:.0f} s after 1970"

@@ -23,9 +23,9 @@ def wall_ns(seconds: float) -> Ns:
 
 
 def agreed(times: Iterable[Ns], current: Ns | None = None, kept: Collection[Ns] = ()) -> Ns:
-    """The median of several clocks at one instant. Of two middle clocks: the nearer to the agreed time of clocks `kept`
-    synchronised by a time service; else the nearer to `current`, the present fleet time, which more hosts may share;
-    else the lower. Raises ValueError for no clocks."""
+    """The median of several clocks at one instant. Of two middle ones: the nearer to the agreed time of those `kept` by
+    a time service; else to `current` fleet time, which more hosts may share; else the lower. Raises ValueError for no
+    clocks."""
     all_times = sorted(times)
     if kept:
         current = agreed(kept, current)
@@ -63,14 +63,12 @@ class FleetClock:
         return now + self._offset
 
     def step(self, time: Ns, now: Ns) -> None:
-        """Set fleet time to `time` at `now`."""
         self._offset, self.set_at, self._doubted = time - now, now, None
 
     def correct(self, walls: Mapping[HostName, Ns], now: Ns, kept: Collection[HostName] = ()) -> Ns:
-        """Compare fleet time with hosts' clocks read at `now`, of which a time service synchronises those in `kept`.
-        Return the correction, 0 if there is none.
-
-        Missing hosts count with their clocks of the last hour: a host that is alone for a while is not the majority."""
+        """Compare fleet time with hosts' clocks read at `now`, of which a time service keeps those in `kept`. Return
+        the correction; 0: none. Missing hosts count with their clocks of the last hour: a host that is alone for a
+        while is not the majority."""
         offsets, before = {host: wall - now for host, wall in walls.items()}, self._hosts
         silent = [item for item in before.items() if item[0] not in walls and now - item[1].at < REMEMBERED]
         latest = [(host, _Clock(offset, now, host in kept)) for host, offset in offsets.items()]

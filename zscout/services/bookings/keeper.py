@@ -76,7 +76,7 @@ class BookingFile:
         return found
 
     def _set_aside(self) -> str:
-        """Copy the file aside, replacing the last copy; return a remark for the log."""
+        """Return a remark for the log."""
         try:
             shutil.copy(self._path, self._path.with_name(ASIDE))
         except OSError as error:
@@ -92,7 +92,7 @@ class BookingFile:
 
 class BookingKeeper:
     """Stores bookings and answers the leader. `wall`: the host's clock in seconds since 1970 (UTC); None: the present
-    time, continued by the mesh's clock. `synchronised`: True if a time service synchronises that clock."""
+    time, continued by the mesh's clock. `synchronised`: by a time service."""
 
     def __init__(
         self,
@@ -124,7 +124,6 @@ class BookingKeeper:
             self._saved = self.records.digest()
 
     def start(self, supervisor: Supervisor) -> None:
-        """Answer the leader from now on."""
         self._supervisor, keys, guard = supervisor, self.mesh.keys, supervisor.guard
         key = keys.bookings(self.mesh.me.host)
         self._declared = [
@@ -140,9 +139,8 @@ class BookingKeeper:
             declared.close()
 
     def observe(self, grants: messages.Grants) -> None:
-        """Take a publication of the leader. A delayed publication, such as an earlier leader's after a stall, shows too
-        early a fleet time, but no delay changes when fleet time began. The fleet time of a leader that began without
-        any is younger than ours, until it learns ours."""
+        """Take a publication of the leader. A delayed one shows too early a fleet time, but no delay changes when fleet
+        time began. A leader that began without fleet time has a younger one than ours, until it learns ours."""
         if grants.time is None:
             return
         self._check_queried(grants)
@@ -191,7 +189,7 @@ class BookingKeeper:
         return True
 
     def answer_to(self, digest: str, *, durable: bool) -> messages.BookingsKept:
-        """The answer to a leader with this `digest`, with records if they differ."""
+        """Has records if the digests differ."""
         own, fleet_time = self.records.digest(), self.time
         return messages.BookingsKept(
             self.mesh.me.host,

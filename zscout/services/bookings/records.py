@@ -74,7 +74,7 @@ class Records:
         return changed
 
     def remove(self, booking: str) -> None:
-        """Remove the record, leaving no trace."""
+        """Leaves no trace."""
         if self._records.pop(booking, None) is not None:
             self.size -= len(self._encoded.pop(booking))
             self._digest = None

@@ -28,8 +28,8 @@ class Account:
 def accounts(
     holds: Iterable[PastHold], keys: Callable[[PastHold], Iterable[str]], window: Span, *, by_rc: bool = False
 ) -> list[Account]:
-    """An account for each key in `keys` of any hold, by seconds held, descending. Holds in force count up to the
-    window's end; if the end of a hold was missed, it counts as far as known. `by_rc`: the keys are RCs."""
+    """An account for each key of any hold, by seconds held, descending. Holds in force count up to the window's end,
+    those with a missed end as far as known. `by_rc`: the keys are RCs."""
     found: dict[str, Account] = {}
     for hold in holds:
         ended = window.ended if hold.ended is None else hold.ended

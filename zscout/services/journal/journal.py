@@ -59,8 +59,8 @@ class Journal:
         wall: Callable[[], float] = time.time,
         on_opened: Callable[[list[PastHold]], object] = lambda _: None,
     ) -> None:
-        """`wall`: seconds since 1970, UTC. `on_opened` is called once, in the event loop, with the latest holds of the
-        reopened journal, oldest first."""
+        """`wall`: seconds since 1970, UTC. `on_opened` is called once, in the event loop, with the latest holds, oldest
+        first."""
         self._mesh, self._silent, self._wall, self._on_opened = mesh, silent, wall, on_opened
         self._store = JournalStore(folder, config.max_age / SECOND, config.max_size * MEGABYTE)
         self._supervisor = Supervisor(
@@ -108,8 +108,7 @@ class Journal:
         await self._supervisor.close()
 
     def observe(self, grants: Grants) -> None:
-        """Take each publication of the leader, heartbeats included. Never raises: candidates also lead without a
-        journal."""
+        """Takes publications and heartbeats. Never raises: candidates also lead without a journal."""
         try:
             if self._supervisor.active:
                 self._observe(grants)

@@ -56,8 +56,8 @@ def unknown_to_all(journals: Sequence[History], window: Span) -> list[Span]:
 
 
 def enough(journals: Mapping[HostName, History], window: Span) -> list[HostName]:
-    """Hosts whose journals together cover as much as all: the most complete first. Without candidates in the fleet file
-    every node keeps a journal, each with up to 180,000 holds."""
+    """Hosts whose journals cover as much as all, the most complete first: without candidates in the fleet file every
+    node keeps one, with up to 180,000 holds."""
     unknown = {host: unknown_to(journal, window) for host, journal in journals.items()}
     chosen: list[HostName] = []
     left = [window]

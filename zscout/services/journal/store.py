@@ -94,8 +94,8 @@ class JournalStore:
         self._before = 0  # the last hold before this process: its times are of another clock
 
     def open(self) -> tuple[list[Grant], float | None]:
-        """Return the open holds, and the time of the last publication, of the closed journal. An unreadable file is set
-        aside. Raises Unwritable."""
+        """Return the open holds and the last publication's time of the closed journal. Sets an unreadable file aside.
+        Raises Unwritable."""
         with self._one:
             try:
                 db = self._opened()

@@ -73,7 +73,7 @@ class ComponentHost:
         await self.supervisor.close()
 
     def take(self, rules: ComponentsConfig) -> None:
-        """Take new rules for later starts; running components continue."""
+        """For later starts; running components continue."""
         self._rules = rules
 
     def running(self) -> list[RunningComponent]:

@@ -37,8 +37,8 @@ SLACK: Final = 5.0  # seconds for an answer, beyond those for carrying out the o
 
 
 class ComponentProcess:
-    """One incarnation of a component. `where` is the kind's `module:class`; `fleet` how a child joins; `now` the node's
-    clock; `on_over` is called once, at its end."""
+    """One incarnation. `where`: the kind's `module:class`; `fleet`: how a child joins; `now`: the node's clock;
+    `on_over` is called once, at its end."""
 
     def __init__(
         self,
@@ -154,7 +154,6 @@ class ComponentProcess:
         return self.view()
 
     async def activate(self, order: messages.ActivateComponent) -> ComponentView:
-        """Return when it runs, or has ended."""
         self._send(Order(0, order))
         await self.running.wait()
         return self.view()
@@ -230,7 +229,6 @@ class ComponentProcess:
             output.finish()
 
     async def _serve_connection(self, connection: socket.socket, child: subprocess.Popen[bytes]) -> None:
-        """Give a child its job, and return at its end."""
         loop = asyncio.get_running_loop()
         # A socket for orders alone: if one fails, asyncio would close the connection with unread messages.
         sending = connection.dup()
@@ -306,7 +304,6 @@ class ComponentProcess:
             self._kill(EndReport("failed", f"it was killed: it did not get ready within {timeout:g} s"))
 
     def _kill(self, verdict: EndReport) -> None:
-        """Kill it, unless it has ended."""
         if self.over.is_set():
             return
         self._verdict = self._verdict or verdict
@@ -349,7 +346,6 @@ class ComponentProcess:
 
 
 async def _speak(connection: socket.socket, frames: asyncio.Queue[bytes]) -> None:
-    """Send the frames until the other side has closed."""
     loop = asyncio.get_running_loop()
     connection.setblocking(False)
     with suppress(OSError):

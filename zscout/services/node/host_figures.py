@@ -35,9 +35,7 @@ class HostMemory(NamedTuple):
 
 
 class Cgroup:
-    """The limits of a process's control groups and their parents.
-
-    `root`: their mount point; `of`: the file that lists the process's groups."""
+    """Limits of a process's control groups and their parents. `root`: mount point; `of`: the file with its groups."""
 
     def __init__(self, root: Path = Path("/sys/fs/cgroup"), of: Path = Path("/proc/self/cgroup")) -> None:
         places = own_groups(of)
@@ -129,7 +127,6 @@ def read_text(file: Path) -> str:
 
 
 def _whole(text: str) -> int | None:
-    """A whole number of at most 20 digits."""
     text = text.strip()
     try:
         return int(text) if len(text) <= 20 else None

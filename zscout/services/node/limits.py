@@ -166,8 +166,8 @@ def _make(group: ComponentGroup, folder: Path, wanted: dict[str, str], also: dic
 
 
 def _may_delegate(base: Path, controller: str) -> bool:
-    """Return True if groups below `base` have, or now get, a controller. Only the root group can pass a controller on
-    while it holds processes: if all processes of `base` are the node's own, move them into a group below."""
+    """Return True if groups below `base` have, or now get, a controller. Only the root group passes one on while it
+    holds processes: if all of `base` are the node's own, they move into a group below."""
     if controller not in read_text(base / "cgroup.controllers").split():
         return False
     switch = base / "cgroup.subtree_control"

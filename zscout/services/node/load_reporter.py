@@ -37,9 +37,8 @@ LoadFigures: TypeAlias = tuple[tuple[float, float, float], float, int]
 
 
 class LoadReporter:
-    """Publishes this host's load until stopped. With `tree`, only the load of this process and its descendants.
-
-    A failure is logged, withdraws the liveliness token, and restarts after RESTARTS seconds: the node continues."""
+    """Publishes this host's load until stopped; with `tree`, of this process and its descendants only. A failure is
+    logged, withdraws the liveliness token, and restarts after RESTARTS seconds: the node continues."""
 
     def __init__(
         self,
@@ -81,7 +80,6 @@ class LoadReporter:
         self._publisher.close()
 
     def _with_files(self, report: LoadReport) -> LoadReport:
-        """Add the node's certificate, files and recorder to a report."""
         if self._recorder is not None:
             report = replace(report, recorder=self._recorder.fault[:MAX_ERROR])
         if (files := self._files) is not None:

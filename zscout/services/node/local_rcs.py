@@ -42,8 +42,8 @@ class _Running:
 
 
 class LocalRcs:
-    """`folder` returns the state folder, if there is one. `on_failure` is called with the error of an RC that fails
-    later. Raises BadInput if a driver is missing."""
+    """`folder` returns the state folder, if any. `on_failure` gets the error of an RC that fails later. Raises BadInput
+    if a driver is missing."""
 
     def __init__(
         self,
@@ -63,13 +63,13 @@ class LocalRcs:
         return [running.rc for running in self._running.values()]
 
     async def start(self) -> None:
-        """Start all. Raises MeshError or RcNotOpened at the first RC that can't be started."""
+        """Raises MeshError or RcNotOpened at the first RC that can't be started."""
         for spec in _robots_last(self._node.rcs):
             await self._open(spec, self._drivers.pop(spec.name))
 
     async def take(self, node: Node) -> None:
-        """Stop RCs that the file no longer lists, start new ones, and restart those whose table changed; the others
-        continue. Raises RcNotOpened once all have been tried."""
+        """Stop RCs no longer listed, start new ones, restart changed ones; the others continue. Raises RcNotOpened once
+        all have been tried."""
         wanted, faults = {spec.name: spec for spec in node.rcs}, list[str]()
         gone = [name for name, running in self._running.items() if wanted.get(name) != running.spec]
         await self._close(gone, {name: "changed in" if name in wanted else "removed from" for name in gone})

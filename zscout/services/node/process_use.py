@@ -22,7 +22,6 @@ PROC: Final = Path("/proc")
 
 
 def since_boot() -> float:
-    """Seconds since the host's start."""
     return time.clock_gettime(time.CLOCK_BOOTTIME)
 
 
@@ -131,9 +130,7 @@ class TreeUse(NamedTuple):
 
 class TreeMeter:
     """Measures the process `root` (default: our own) and its descendants, from one thread. Raises OSError without
-    /proc.
-
-    Without waiting times from the system, `wanted` is the number of runnable threads."""
+    /proc. Without waiting times from the system, `wanted` is the number of runnable threads."""
 
     def __init__(self, root: int | None = None, *, proc: Path = PROC, now: Callable[[], float] = since_boot) -> None:
         self._root = os.getpid() if root is None else root
@@ -221,20 +218,18 @@ def _demand(before: Mapping[int, _Demand], now: Mapping[int, _Demand]) -> _Deman
 
 
 def _runnable(proc: Path, pids: Iterable[int]) -> int:
-    """Threads that run or wait for a processor now, except the caller."""
+    """Except the caller."""
     mine = threading.get_native_id()
     return sum(thread != mine and _fields(stat)[:1] == [b"R"] for thread, stat in _tasks(proc, pids, "stat"))
 
 
 def _names(folder: str) -> list[str]:
-    """Names in a folder; none if it is gone."""
     with suppress(OSError), os.scandir(folder) as entries:
         return [entry.name for entry in entries]
     return []
 
 
 def _read(path: str) -> bytes:
-    """A small file of /proc; empty if it is gone."""
     try:
         fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
         try:

@@ -27,8 +27,7 @@ MAX_NAMED: Final = 12  # keys named in one line
 
 @dataclass(slots=True)
 class FilesInForce:
-    """What a node publishes about its files: the digest of the rights in force, and the fault that keeps newer files
-    from being used (empty: none)."""
+    """The digest of the rights in force, and the fault that keeps newer files from being used (empty: none)."""
 
     rights: str
     fault: str = ""
@@ -45,8 +44,8 @@ class Reload:
         self._asked = asyncio.Event()
 
     def takes(self, take: Callable[[Node], object], *tables: str) -> None:
-        """Call `take` in the event loop with the new settings after a change of these tables or keys; it may return an
-        awaitable. Its errors are logged, and the previous settings stay in force."""
+        """Call `take` in the event loop after a change of these tables or keys; it may return an awaitable. Its errors
+        are logged, and the previous settings stay in force."""
         self._takers.append((frozenset(tables), take))
 
     def on_hangup(self) -> None:

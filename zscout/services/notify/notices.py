@@ -32,8 +32,7 @@ class Notification(NamedTuple):
 
 
 class HoldNotices:
-    """A HoldListener that notifies of grants after a wait of at least `after`, of preempted holds, and of unwell
-    devices."""
+    """Notifies of grants after a wait of at least `after`, of preempted holds, and of unwell devices."""
 
     def __init__(self, fleet: str, after: Ns, notify: Callable[[Notification], object]) -> None:
         self._fleet, self._after, self._notify = fleet, after, notify

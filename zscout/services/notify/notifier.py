@@ -32,8 +32,7 @@ LOOK: Final = 60.0
 
 
 class Notifier:
-    """`holds` is the listener for holds; `reports` returns the newest load reports of all hosts while this node leads,
-    else none."""
+    """`holds`: a HoldListener; `reports`: the newest load reports of all hosts while this node leads, else none."""
 
     def __init__(
         self,
@@ -66,7 +65,7 @@ class Notifier:
         self._supervisor.cancel()
 
     def notify(self, notification: Notification) -> None:
-        """Queue a notification; never blocks."""
+        """Never blocks."""
         if not self._addresses(notification):
             return
         try:
@@ -86,8 +85,6 @@ class Notifier:
         for expiry in self._certificates.look(self._reports()):
             self.notify(expiry)
         self._supervisor.call_later(self._look_every, self._look)
-
-    # In the thread
 
     def _run(self) -> None:
         while not self._stopping.is_set():

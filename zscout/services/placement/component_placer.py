@@ -33,8 +33,8 @@ PUBLISH_AT_ONCE: Final = 200  # components in one publication
 
 
 class ComponentPlacer:
-    """The placer of one term. `inherited` comes from its predecessor, `maintained` are the hosts in maintenance. Stop
-    it after `on_failure`."""
+    """The placer of one term. `inherited` is its predecessor's, `maintained` the hosts in maintenance. Stop it after
+    `on_failure`."""
 
     def __init__(
         self,

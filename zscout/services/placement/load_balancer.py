@@ -52,7 +52,6 @@ class LoadBalancer:
         self._declarations.close()
 
     def _read(self) -> None:
-        """Read a few reports, then let the loop do other work."""
         read = 0
         for key, report in itertools.islice(self._reports.each(), AT_ONCE):
             read += 1

@@ -39,8 +39,8 @@ class _Waiting:
 
 
 class PlacerRequestHandler:
-    """Answers a request to place, end or move a component once its state settles, or its `wait` is over. `feed` passes
-    an event to the core, and returns the refusals."""
+    """Answers requests once the component's state settles, or their `wait` is over. `feed` passes an event to the core,
+    and returns the refusals."""
 
     def __init__(
         self,
@@ -93,7 +93,7 @@ class PlacerRequestHandler:
             self._carry_out(query, event)
 
     def close(self) -> None:
-        """Refuse all waiting requests: another placer must be asked."""
+        """Another placer must be asked."""
         problem = Refused("not_leading", "this placer stopped leading; try again").problem
         for query in (*(query for query, _ in self._early), *self._waiting):
             query.refuse(problem)

@@ -69,8 +69,6 @@ class Date(NamedTuple):
 
 
 class _Expanded(NamedTuple):
-    """A record and the core's bookings for its dates."""
-
     record: BookingRecord
     rank: tuple[int, Grant, str]
     ahead: Ns
@@ -83,7 +81,7 @@ class _Expanded(NamedTuple):
 
 
 class BookedDates:
-    """The dates of a leader. The caller sets `now`, by the host's clock."""
+    """The caller sets `now`, by the host's clock."""
 
     def __init__(self, core: Core, records: Records, clock: FleetClock) -> None:
         self._core, self._records, self.clock = core, records, clock
@@ -110,7 +108,6 @@ class BookedDates:
         return self.to_fleet(self.now) / SECOND
 
     def local(self, instant: Instant) -> Ns:
-        """The time of an instant on the core's clock."""
         return instant * SECOND - self._dated_by
 
     def to_fleet(self, time: Ns) -> Ns:
@@ -118,8 +115,8 @@ class BookedDates:
         return time + self._dated_by
 
     def claim(self, date: Date, *, taken: bool = False) -> Booking:
-        """The core's booking for a date; if it is `taken`, it does not lapse before its end. Raises ValueError for a
-        malformed record."""
+        """The core's booking for a date; if `taken`, it lapses only at its end. Raises ValueError for a malformed
+        record."""
         record = date.record
         for need in record.needs:
             (check_maintained if record.maintenance else check_need)(need)
@@ -148,8 +145,8 @@ class BookedDates:
         return request if start is None else replace(request, not_before=self.local(start))
 
     def open_dates(self, record: BookingRecord, taken: Collection[str] = ()) -> list[Date]:
-        """The dates of a booking that are not over; of a repeated booking, those within the next 60 days. `taken` dates
-        do not lapse."""
+        """The dates of a booking that are not over, of a repeated one for the next 60 days. `taken` dates do not
+        lapse."""
         if record.unbooked:
             return []
         if not 0 < record.runtime <= MAX_AHEAD or (starts := self._starts(record)) is None:
@@ -179,7 +176,6 @@ class BookedDates:
         return min((known.next for known in self._expanded.values()), default=math.inf) - WINDOW - self.time
 
     def _lasting(self) -> list[BookingRecord]:
-        """Maintenance without an end."""
         return [
             record for record in self._records if record.lasting and not record.unbooked and _end(record) > self.time
         ]
@@ -189,7 +185,7 @@ class BookedDates:
         return min(map(_end, self._lasting()), default=math.inf) - WINDOW / 2 - self.time
 
     def renew(self) -> None:
-        """Extend maintenance without an end to 60 days from now, where less than half of that is left."""
+        """To 60 days from now, where less than half of that is left."""
         for record in self._lasting():
             if _end(record) - self.time <= WINDOW / 2:
                 self._restart(record)
@@ -199,25 +195,22 @@ class BookedDates:
         self.change(record, start=int(self.time), runtime=Decimal(WINDOW), patience=Decimal(WINDOW))
 
     def _lapsed(self, date: Date) -> bool:
-        """Return True if no request took up this date in time. That follows from the time alone, so it is not
-        stored."""
+        """Return True if no request took the date up in time. It follows from the time alone, so it is not stored."""
         waits = date.record.runtime if date.record.maintenance else min(date.record.patience, date.record.runtime)
         if self.local(date.start) + round(waits * SECOND) > self.now:
             return False
         kept = self._core.booking(date.id)
         return kept is None or kept.arc is None
 
-    # The core's claims
-
     def recovered(self, taken: Collection[str]) -> Dates:
-        """The event with all dates for the core of a new leader; `taken`: dates that ARCs have taken up."""
+        """`taken`: dates that ARCs have taken up."""
         found = Dates(tuple(self._ranked(taken)))
         self._sent = frozenset(booking.id for booking in found.ranked)
         return found
 
     def parts(self) -> Iterator[Dates]:
-        """The dates of `recovered` in events of bounded size, to be sent before it; without lapsed dates that may turn
-        out to be taken up."""
+        """The dates of `recovered` in events of bounded size, sent before it; without lapsed ones that may turn out to
+        be taken up."""
         part = list[Booking]()
         for record in list(self._records):
             known = self._expanded[record.id] = self._expand(record, ())
@@ -290,11 +283,10 @@ class BookedDates:
         return event
 
     def redate(self, *, settled: bool) -> bool:
-        """Follow a step of fleet time. Return True if there was one, so that all dates must be reconciled.
-
-        If fleet time is `settled`, skipped dates are reported, and maintenance without an end restarts now. A taken
-        date is over if its end is now past, or if its ARC holds RCs and its start is now in the future: the ARC
-        continues without a booking, so that no date begins twice."""
+        """Follow a step of fleet time. Return True if there was one: all dates must be reconciled. If fleet time is
+        `settled`, skipped dates are reported, and maintenance without an end restarts now. A taken date is over if its
+        end is now past, or if its ARC holds RCs and its start is now in the future: the ARC continues without a
+        booking, so that no date begins twice."""
         now, ahead = self.now, self.clock.at(self.now) - self.now
         if ahead == self._dated_by:
             return False
@@ -326,8 +318,7 @@ class BookedDates:
                 self.change(record, over=sorted({*record.over, *starts}))
 
     def number(self) -> Grant:
-        """The (term, seq) of a change made now: above that of all known records, even if terms restarted with the
-        fleet."""
+        """The (term, seq) of a change now: above all known records, even if terms restarted with the fleet."""
         own = Grant(self._core.term, self._core.number())
         latest = self._records.latest
         return own if own > latest else Grant(latest.term, latest.seq + 1)
@@ -341,8 +332,8 @@ class BookedDates:
         return self._records.get(record.id) or new
 
     def note(self, effects: Iterable[Effect], *, settled: bool) -> bool:
-        """Take over the effects of an instant on dates. Return True if `reconcile` must be called in another instant.
-        Unless fleet time is `settled`, used dates are not stored as over: they may still be in the future."""
+        """Note the effects on dates. Return True if `reconcile` must be called in another instant. Unless fleet time is
+        `settled`, used dates are not stored as over: they may still be in the future."""
         over: dict[str, list[Instant]] = {}
         lapsed = False
         for effect in effects:
@@ -387,10 +378,7 @@ class BookedDates:
         date = self.date(by)
         return f"{by if date is None else f'{date.record.name} of {date.record.owner}'} takes precedence"
 
-    # For people and programs
-
     def dates_in_core(self, record: BookingRecord) -> list[Date]:
-        """The dates of a booking that are in the core."""
         return [date for date in self.open_dates(record) if self._core.booking(date.id) is not None]
 
     def view(self, record: BookingRecord) -> BookingView:
@@ -417,7 +405,7 @@ def start_of(name: str) -> Instant | None:
 
 
 def _end(record: BookingRecord) -> float:
-    """The end of a booking that is not repeated."""
+    """Of a booking that is not repeated."""
     return record.start + float(record.runtime)
 
 

@@ -53,8 +53,6 @@ NAMED: Final = 3
 
 @dataclass(slots=True, eq=False)
 class _Undecided:
-    """An operation that waits for votes."""
-
     ticket: Ticket
     decide: Callable[[], bool]
     """Try to decide it, and return True if that succeeds."""
@@ -62,7 +60,7 @@ class _Undecided:
 
 
 class BookingHandler:
-    """Adds the results of operations to `out` of the dates, until the caller takes them."""
+    """Results are added to `out` of the dates."""
 
     def __init__(
         self,
@@ -82,7 +80,7 @@ class BookingHandler:
         self._keeping = 0
 
     def operation(self, ticket: Ticket, sender: Sender, operation: Operation) -> None:
-        """Carry out an operation; the core must be at the present time. Raises Refused."""
+        """The core must be at the present time. Raises Refused."""
         check_name(operation.id, "id")
         match operation:
             case Book():
@@ -91,8 +89,6 @@ class BookingHandler:
                 self._unbook(ticket, operation, sender)
             case FindSlots():
                 self._find_slots(ticket, operation, sender)
-
-    # Booking
 
     def _book(self, ticket: Ticket, wanted: Book, sender: Sender) -> None:
         if self._is_made(ticket, wanted.id, sender):
@@ -118,7 +114,7 @@ class BookingHandler:
         return True
 
     def _record(self, wanted: Book, sender: Sender) -> BookingRecord:
-        """The new record. Raises Refused for an invalid booking."""
+        """Raises Refused for an invalid booking."""
         time = self._dates.time
         try:
             check_name(wanted.name, "name of the booking")
@@ -171,8 +167,8 @@ class BookingHandler:
             raise Refused("too_many", f"{MAX_CLAIMS} dates are booked, the most allowed; repeat it less often")
 
     def _check_share(self, record: BookingRecord, own: list[BookingRecord]) -> None:
-        """Raises Refused if the owner would have more than half of the fleet's bookings, or dates. A cancelled booking
-        counts until its last date is over."""
+        """Raises Refused if the owner would have more than half of the fleet's bookings, or dates; cancelled ones count
+        to their end."""
         if len(own) >= MAX_BOOKINGS // 2:
             words = f"{record.owner} has {len(own)} bookings, cancelled ones included, the most allowed"
             raise Refused("too_many", f"{words}; ask again when some are over")
@@ -184,8 +180,8 @@ class BookingHandler:
             )
 
     def _decide(self, ticket: Ticket, record: BookingRecord) -> bool:
-        """Make the booking if all its dates in the window are free, refuse it if one is not; return False while votes
-        are missing. Raises Refused if there is no room for it."""
+        """Make the booking if all its dates in the window are free; return False while votes are missing. Raises
+        Refused if a date is taken, or there is no room."""
         self._check_room(record)
         unknown, bound = [], dict[int, dict[str, str]]()
         # Maintenance takes precedence over bookings: the owners of conflicting bookings are notified.
@@ -225,7 +221,6 @@ class BookingHandler:
         return f"not all of {', '.join(date.record.needs)} are free at {in_zone(date.start, date.record.zone)}: {why}"
 
     def _share(self, booking: Booking, other: Booking) -> bool:
-        """Return True if `other` needs an RC that `booking` has."""
         status = self._core.booking(booking.id)
         names = {*booking.needs, *booking.bound.values(), *(() if status is None else status.maintained)}
         return any(rc in names or (is_pattern(rc) and any(map(matcher(rc), names))) for rc in other.needs)
@@ -251,8 +246,6 @@ class BookingHandler:
         else:
             self._dates.out.answers.append((keep.ticket, self._dates.view(record)))
 
-    # Cancelling
-
     def _unbook(self, ticket: Ticket, operation: Unbook, sender: Sender) -> None:
         record = self._records.get(operation.id)
         if record is None:
@@ -269,8 +262,6 @@ class BookingHandler:
             raise Refused("bad_date", f"{date} is not a date of {record.name}; see zscout booking list")
         self._dates.out.events.append(self._dates.reconcile())
         self._answer_kept(ticket, new)
-
-    # Finding free slots
 
     def _find_slots(self, ticket: Ticket, asked: FindSlots, sender: Sender) -> None:
         self._admission.check_booking(asked, sender)
@@ -301,8 +292,6 @@ class BookingHandler:
             likely = None
         self._dates.out.answers.append((ticket, SlotsTold(asked.id, self._dates.time, slots, found.complete, likely)))
         return True
-
-    # Votes
 
     def _try(self, undecided: _Undecided) -> None:
         if len(self.undecided) >= MAX_UNDECIDED:
@@ -346,11 +335,9 @@ class BookingHandler:
     def _now(self) -> Ns:
         return self._dates.now
 
-    # Taking up
-
     def take_up(self, ask: Ask, sender: Sender) -> str:
-        """The core's name of the date that a request uses. An ARC that continues may name a date that is not known here
-        yet; empty if its date is over. Raises Refused."""
+        """The core's name of the date that a request uses; empty if it is over. An ARC that continues may name an
+        unknown one. Raises Refused."""
         booking, _, start = ask.booking.partition("@")
         record = self._records.get(booking)
         continues = ask.place is not None or ask.grant is not None
@@ -367,8 +354,6 @@ class BookingHandler:
             return next((date.id for date in self._dates.open_dates(record) if str(date.start) == start), "")
         why = "another request uses it" if dates_ else "its dates are over, or another booking takes precedence"
         raise Refused("unknown_booking", f"booking {record.name} can't be used: {why}; see zscout booking list")
-
-    # For people and programs
 
     def views(self, owner: str | None = None, rc: str | None = None) -> list[BookingView]:
         views = []

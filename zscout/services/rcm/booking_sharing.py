@@ -83,7 +83,6 @@ class BookingSharing:
         """By host: its clock less the own monotonic clock, at the last reading."""
 
     def start(self) -> None:
-        """Start answering and sharing."""
         keys, mesh, guard = self._mesh.keys, self._mesh, self._supervisor.guard
         self._declared = [
             *(
@@ -127,7 +126,6 @@ class BookingSharing:
             self.catch_up()
 
     def share_soon(self, records: Iterable[BookingRecord]) -> None:
-        """Share changed records soon."""
         if changed := {record.id: record for record in records}:
             self._unshared |= changed
             self._news.set()

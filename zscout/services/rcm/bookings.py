@@ -49,8 +49,8 @@ class _Due(Enum):
 
 
 class Bookings:
-    """The bookings of one term. `drained`: the hosts in maintenance. Before `settles_at` some dates of the fleet may be
-    unknown: after a restart of all hosts, each knows only its own records."""
+    """`drained`: hosts in maintenance. Before `settles_at` some dates of the fleet may be unknown: after a restart of
+    all hosts, each knows only its own records."""
 
     def __init__(
         self,
@@ -82,7 +82,6 @@ class Bookings:
             self._deadlines.set(settles_at + SLACK, (_Due.RECONCILE, None))
 
     def at(self, now: Ns) -> Self:
-        """Set the present time."""
         self.dates.now = now
         return self
 
@@ -105,8 +104,6 @@ class Bookings:
     def next(self) -> Ns | None:
         return self._deadlines.next
 
-    # Reading
-
     def take_up(self, ask: Ask, sender: Sender) -> str:
         return self.handler.take_up(ask, sender)
 
@@ -117,13 +114,11 @@ class Bookings:
         return self._records.get(booking)
 
     def recovered(self, taken: Collection[str]) -> Sequence[Event]:
-        """The events with all dates for the core; `taken`: dates that ARCs have taken up."""
+        """`taken`: dates that ARCs have taken up."""
         return [self.dates.recovered(taken)]
 
     def proposal(self, asked: Propose) -> Proposed:
         return self.handler.proposal(asked)
-
-    # Stimuli
 
     def operation(self, ticket: Ticket, sender: Sender, operation: Operation) -> Outbox:
         try:
@@ -151,7 +146,6 @@ class Bookings:
         return self._out()
 
     def shared(self) -> Outbox:
-        """Keepers sent records that were unknown here."""
         self._once(_Due.RECONCILE, 0)
         return self._out()
 
@@ -188,7 +182,6 @@ class Bookings:
         return self._out()
 
     def tick(self) -> Outbox:
-        """Carry out the deadlines that are over."""
         while (due := self._deadlines.pop_due(self.dates.now)) is not None:
             self._set.discard(due[0])
             match due:
@@ -240,8 +233,8 @@ class Bookings:
             self._once(_Due.DANGERS, DANGER_DELAY)
 
     def _report_dangers(self) -> None:
-        """Report dangers that changed since the last report: one report for all dates of a booking, the next dates
-        first, as the number of notices to people is bounded."""
+        """Report changed dangers: once for all dates of a booking, the next dates first, as notices to people are
+        bounded."""
         before, self._reported = self._reported, self.dates.dangers()
         news = dict[tuple[str, str], list[Date]]()
         for name in before.keys() | self._reported.keys():
@@ -273,9 +266,8 @@ def bookings_of(
 
 
 def oldest(answers: Iterable[BookingsKept]) -> tuple[float, Ns] | None:
-    """The fleet time that has run longest at any host: seconds for which it has run, and the time. If some hosts missed
-    a correction, so that two times have run equally long, the time of more hosts, else the time nearer to their
-    clocks."""
+    """The fleet time that has run longest at any host: its seconds and the time. If a missed correction left two that
+    have run equally long, the one of more hosts, else the nearer to their clocks."""
     heard = [answer for answer in answers if answer.time is not None]
     age = max((answer.time_age for answer in heard), default=None)
     if age is None:
@@ -285,8 +277,8 @@ def oldest(answers: Iterable[BookingsKept]) -> tuple[float, Ns] | None:
 
 
 def _time(keeper: BookingKeeper, kept: Sequence[BookingsKept]) -> tuple[Ns, float]:
-    """Fleet time, and the seconds for which it has run: the oldest of any host; if no host has one, the median of the
-    hosts' clocks, from now on."""
+    """Fleet time, and the seconds for which it has run: the oldest of any host; without any, the median of the clocks,
+    from now on."""
     found = oldest([*kept, keeper.answer_to("", durable=False)])
     if found is not None:
         return found[1], found[0]

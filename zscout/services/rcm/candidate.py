@@ -58,8 +58,6 @@ UNSEEN = "RCs of other hosts see an RCM, and this candidate does not"
 
 
 class CandidateParts(NamedTuple):
-    """Parts of a node that its candidate uses."""
-
     folder: Path | None = None
     """The folder for facts that outlive a restart."""
     authority: Authority | None = None
@@ -182,8 +180,6 @@ class Candidate:
         self.rcm = self.balancer = self.placer = None
         self._leading.close()
 
-    # Observations
-
     def _on_grants(self, _key: str, grants: Grants) -> None:
         known = grants.term == self.known and (self.rcm is None or self.rcm.term == self.known)
         if known or self._weigh(Word(grants.term, Source.LEADER)).believed:
@@ -234,8 +230,6 @@ class Candidate:
     def _learn(self, term: Term) -> None:
         self.terms.highest = max(self.known, term)
 
-    # Leading
-
     async def _run(self) -> None:
         while True:
             self._changed.clear()
@@ -248,8 +242,8 @@ class Candidate:
             await done_within(None if at is None else (at - now) / SECOND, self._changed.wait())
 
     async def _leader_elsewhere(self) -> bool:
-        """Return True if RCs still see a leader, as this candidate is then cut off; or if they have promised a term to
-        another candidate, which may be about to lead."""
+        """Return True if RCs still see a leader: this candidate is cut off; or if they promised a term to another
+        candidate, which may be about to lead."""
         if self._candidacy.stall.fresh():
             self.election.stalled(self.mesh.now())
         keys, tokens = self.mesh.keys, list[Token]()
@@ -288,8 +282,8 @@ class Candidate:
         return len(others) == 1 and all(self.terms.is_doubted(host, now, self.fleet.silence) for host in others)
 
     def _weigh_rcs(self, states: list[RcState], tokens: list[Token]) -> list[tuple[HostName, RcState]]:
-        """Judge the terms of RCs. Return the RCs that do not count as absent because of their terms, each with its
-        host: with `[security]` the host of its token."""
+        """Judge the terms of RCs. Return the RCs that do not count as absent for their terms, with their hosts; with
+        `[security]` their tokens' hosts."""
         seen = {(token.host, token.name, token.instance) for token in tokens}
         now, silence = self.mesh.now(), self.fleet.silence
         heard = list[tuple[HostName, RcState]]()
@@ -301,7 +295,7 @@ class Candidate:
         return heard
 
     async def _has_absurd_term(self, states: list[RcState]) -> bool:
-        """Return True if an RC with a token obeys a term that is absurd to other RCs: those must be asked to go above
+        """Return True if an RC with a token obeys a term that is absurd to other RCs, which must be asked to go above
         it."""
         highest = max(states, key=lambda state: state.term, default=None)
         if highest is None or not any(absurd(highest.term, state.term) for state in states):
@@ -309,8 +303,8 @@ class Candidate:
         return bool(await self.mesh.living(self.mesh.keys.alive_rc(highest.rc), timeout=self._timeout))
 
     async def _take_over(self) -> bool:
-        """Make one attempt to lead. If RCs have promised a higher term, another candidate may be about to lead in it:
-        the next attempt takes a term above that."""
+        """Make one attempt to lead. If RCs have promised a higher term, its candidate may be about to lead; the next
+        attempt goes above it."""
         keys = self.mesh.keys
         if self.election.sees_leader(self.mesh.now()):
             return False
@@ -450,7 +444,7 @@ class Candidate:
 
 def _refusal(reply: Reply[RcState] | Reply[ClientRequests], promise: Term) -> tuple[str, Term] | None:
     """The key of an RC or client that does not promise this term, and the term that it obeys; None: it promises, or
-    names no term."""
+    names none."""
     if reply.message is not None:
         return None if reply.message.term in (promise, NO_TERM) else (reply.key, reply.message.term)
     return None if reply.problem is None or reply.problem.term is None else (reply.key, reply.problem.term)

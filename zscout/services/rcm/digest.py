@@ -40,7 +40,7 @@ class Began(NamedTuple):
 
 
 class Over(NamedTuple):
-    """The end of a hold here. `outcome` and `reason` are None if it continues under another RCM."""
+    """`outcome` and `reason` are None if the hold continues under another RCM."""
 
     began: Began
     at: Ns

@@ -35,8 +35,6 @@ BACKOFF_RESET_AFTER: Ns = 60 * SECOND
 
 
 class Setbacks:
-    """Counts consecutive failures of a candidacy."""
-
     def __init__(self) -> None:
         self._began: Ns = 0
         self._failures = 0
@@ -51,8 +49,8 @@ class Setbacks:
 
 
 def views(sights: Iterable[tuple[HostName, bool]], me: HostName) -> tuple[dict[HostName, bool], bool]:
-    """For each other host, and for this one: True if most of its RCs see a leader. RCs of one host share its view of
-    the mesh. RCs of unknown hosts ("") count as one host, and only if no other host answers."""
+    """For each other host, and for this one: True if most of its RCs see a leader, as RCs of one host share its view.
+    RCs of unknown hosts ("") count as one host, and only if no other host answers."""
     by_host = defaultdict[HostName, list[bool]](list)
     for host, sees in sights:
         by_host[host].append(sees)
@@ -100,7 +98,6 @@ class Election:
         """The host of the last leader that was seen."""
 
     def candidate(self, host: str, *, alive: bool, now: Ns) -> None:
-        """A candidate's token appeared or disappeared."""
         if alive:
             if self._lost.pop(host, None) is not None:
                 self._returned = now
@@ -110,7 +107,6 @@ class Election:
         self._candidates = +self._candidates
 
     def leader(self, instance: str, host: HostName, *, alive: bool, now: Ns) -> None:
-        """A leader's token appeared or disappeared."""
         if alive:
             self.led_by = host
             self._leaders[instance] = self._heard = now
@@ -130,7 +126,6 @@ class Election:
         return any(now - at < self.silence for at in self._leaders.values())
 
     def failed(self, now: Ns) -> None:
-        """An attempt to lead failed."""
         self._not_before = max(self._not_before, now + RETRY)
 
     def outbid(self, now: Ns) -> None:
@@ -138,8 +133,8 @@ class Election:
         self._not_before = now + TURN
 
     def deposed(self, now: Ns, jitter: float, *, led: bool = True) -> None:
-        """A higher term ended the own term. `jitter` is about 1. Unless `led`, the higher term was only promised: a
-        leader of it would show itself, or be seen by RCs, within a turn."""
+        """A higher term ended the own term. `jitter` is about 1. Unless `led`, it was only promised: a leader of it
+        would show itself, or be seen by RCs, within a turn."""
         self._led = led
         if not led:
             self._heard, self._not_before = None, now + TURN
@@ -154,8 +149,7 @@ class Election:
 
     def waited_in_vain(self, others: Mapping[HostName, bool], now: Ns) -> bool:
         """Return True if the only other host that answers has shown a leader for so long that this candidate would have
-        seen it. The time begins again when this candidate sees a leader's token or publication, and continues while no
-        other host answers."""
+        seen it. The time restarts when this candidate sees a leader, and continues while no other host answers."""
         if not others:
             return False
         if list(others.values()) != [True]:
@@ -168,11 +162,10 @@ class Election:
         return now - lone.since >= LEADER_WAIT + self.silence
 
     def must_wait(self, others: Mapping[HostName, bool], own: bool, now: Ns) -> bool:
-        """Return True if RCs show a leader: the RCs of most other hosts (`others`), or of this host (`own`).
-
-        `own` counts only if no other host answers: this host's RCs see no more than this candidate. If this host may
-        be cut off, the candidate waits one more silence. While links return, a single host that shows a leader is
-        enough, as the link to that leader may return next."""
+        """Return True if RCs of most other hosts (`others`), or of this host (`own`), show a leader. `own` counts only
+        if no other host answers: this host's RCs see no more than this candidate. If this host may be cut off, the
+        candidate waits one more silence. While links return, a single host that shows a leader is enough, as the link
+        to that leader may return next."""
         sights = others.values()
         if others:
             self._alone_since = None
@@ -202,7 +195,7 @@ class Election:
         return self._is_back(now) or self._was_away(now)
 
     def _is_back(self, now: Ns) -> bool:
-        """Return True if a host whose candidate had disappeared returned within the last silence."""
+        """Return True if a vanished candidate's host returned within the last silence."""
         return self._returned is not None and now - self._returned <= self.silence
 
     def heard_within(self, span: Ns, now: Ns) -> bool:

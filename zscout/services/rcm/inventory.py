@@ -100,8 +100,6 @@ class Inventory:
             await asyncio.sleep(ASK_TIMEOUT_S)
         log.info("the leader did not list its devices in %d tries", TRIES)
 
-    # On disk
-
     def _load(self) -> None:
         if self._file is None or not self._file.exists():
             return

@@ -21,7 +21,6 @@ class Learned:
         """The last published patience."""
 
     def hear(self, now: Ns, grants: Grants) -> None:
-        """Take in a publication of a believed term."""
         self.keeper.observe(grants)
         self.runtimes.hear(now, grants)
         if grants.charged:

@@ -49,8 +49,6 @@ LATE_VOTE_S = 2.0
 
 
 class Parts(NamedTuple):
-    """Parts of a candidate that its RCM uses."""
-
     inventory: Inventory | None = None
     authority: Authority | None = None
     places: Places | None = None
@@ -72,8 +70,7 @@ class Parts(NamedTuple):
 
 
 class Rcm:
-    """One term of an RCM, from its beginning to its end. When any of its tasks fails, `on_failure` is called with the
-    error, once: the caller must then end the term."""
+    """One term of an RCM. When a task fails, `on_failure` is called once: the caller must then end the term."""
 
     def __init__(
         self,
@@ -134,8 +131,6 @@ class Rcm:
     def bookings(self) -> Bookings:
         return self.sharing.bookings
 
-    # Beginning and end
-
     async def enter(self) -> None:
         """Give the core all dates before the term begins, in parts between which other tasks run."""
         for part in self.bookings.dates.parts():
@@ -191,8 +186,6 @@ class Rcm:
     def on_reload(self) -> None:
         self._take_now(steps.Reloaded())
 
-    # In
-
     def _note_stall(self) -> None:
         """Report a new stall of this process, before the leader judges tokens and answers."""
         stalled = steps.Stalled(self._stall.length, self._stall.ended, self._stall.fresh())
@@ -201,7 +194,6 @@ class Rcm:
             self._coming.append(stalled)
 
     def _take(self, stimulus: steps.Stimulus) -> None:
-        """Add a stimulus to the step of the present burst."""
         first = not self._coming
         if not isinstance(stimulus, steps.OperationAsked):
             self._note_stall()
@@ -214,8 +206,8 @@ class Rcm:
         self._run()
 
     def _concerns(self, query: IncomingQuery[messages.Operation]) -> tuple[Lane, str]:
-        """The lane and host of an operation. Dry runs and slots are questions; an operation on another host's request
-        waits behind the surplus of that host."""
+        """Dry runs and slots are questions; an operation on another host's request waits behind the surplus of that
+        host."""
         operation, host = query.message, self.mesh.keys.sender_of(query.key).host
         if isinstance(operation, (messages.Foresee, messages.FindSlots)):
             return Lane.QUESTION, host
@@ -241,8 +233,6 @@ class Rcm:
         self._note_stall()
         self._run()
 
-    # A step
-
     def _run(self) -> None:
         """Run steps until no stimuli are left."""
         if self._running:
@@ -262,7 +252,7 @@ class Rcm:
             self._running = False
 
     def _carry_out(self, out: steps.Outbox) -> bool:
-        """Carry out the fields of an Outbox in their order. Return False if this leader stepped down."""
+        """In the order of its fields. Return False if this leader stepped down."""
         mesh, supervisor = self.mesh, self.supervisor
         self._answer(out.at_once)
         for word, token in out.higher:
@@ -360,8 +350,6 @@ class Rcm:
                 await asyncio.sleep(due / SECOND)
             else:
                 self._publish(self.leader.heartbeat(self.mesh.now()))
-
-    # Proposals, and ballots
 
     def _propose(self, proposed: steps.Proposed) -> None:
         rc, proposal = proposed

@@ -35,8 +35,6 @@ class _TermFile(msgspec.Struct):
 
 
 class TermFile:
-    """The file of one fleet, in `folder`."""
-
     def __init__(self, folder: Path, fleet: str) -> None:
         self._path, self._fleet = folder / FILE, fleet
 

@@ -145,8 +145,8 @@ class _Files:
         prune(self._settings.path, self._fleet.name, limit=self._settings.limit * MEGABYTE)
 
     async def keep(self, recorder: Recorder, out: BinaryIO) -> None:
-        """Start another file after PART seconds, at MAX_PART bytes, or if the present file can't be written (reported
-        at once); remove the oldest recordings. Does not return."""
+        """Start another file after PART seconds, at MAX_PART bytes, or if this one can't be written (reported at once);
+        remove the oldest recordings. Does not return."""
         fault, due = "", time.monotonic() + CHECK_EVERY
         while True:
             await asyncio.sleep(min(LOOK_EVERY, CHECK_EVERY))

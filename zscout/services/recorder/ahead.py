@@ -75,8 +75,8 @@ def rows_of(bars: Iterable[Bar], now: float) -> int:
 
 
 def chart(bars: Iterable[Bar], now: float, ahead: Ahead, rows: int, *, stale: bool = False) -> dict[str, ChartLayer]:
-    """Layers by name. `rows`: rows of the tallest chart. `stale`: bookings are not received any more; `now` is then the
-    time of the last answer."""
+    """Layers by name. `rows`: of the tallest chart. `stale`: bookings are not received any more; `now` is the last
+    answer's time."""
     within = _within(bars, now, ahead.seconds)
     names, seats = _seated(within)
     scale, high = (CHART_WIDTH - LEFT) / ahead.seconds, chart_row(rows)
@@ -124,9 +124,8 @@ def _within(bars: Iterable[Bar], now: float, seconds: float) -> list[Bar]:
 
 
 def _seated(bars: Sequence[Bar]) -> tuple[list[str], list[int | None]]:
-    """Assign rows to bars, which are in order of their starts; simultaneous bars of an RC get separate rows. Return the
-    name of each row (empty below an RC's first), and the row of each bar (None beyond the limits, which add a last row
-    with the count)."""
+    """Rows for bars in order of their starts; simultaneous bars of an RC get separate rows. Return each row's name
+    (empty below an RC's first), and each bar's row (None beyond the limits, which add a last row with the count)."""
     ends: dict[str, list[float]] = {}
     seats: list[tuple[str, int] | None] = []
     free = MAX_CHART_ROWS

@@ -95,7 +95,6 @@ class RobotLayout(NamedTuple):
 
     @property
     def any(self) -> bool:
-        """True for the layout of a fleet with robots."""
         return bool(self.cameras or self.floor or self.behavior_rows)
 
 
@@ -103,16 +102,13 @@ NO_ROBOTS: Final = RobotLayout()
 
 
 class Layout(msgspec.Struct, frozen=True):
-    """The content to lay out.
-
-    `span`: start and end of a finished run, in seconds of the timeline; None for a live layout, whose window follows
-    the newest data and shows the last minute. `wall`: the timeline has wall-clock times. `rc_rows`, `arc_rows` and
-    `host_rows`: rows expected in the upper panes, which share the height accordingly; `host_rows` is 0 without
-    components. `waiting_rows`: rows of the pane of waiting requests, 0 without that pane. `banner`: a text above all
-    panes. `contended` and `absent`: rows by entity of devices that several requests want, and of absent devices; beyond
-    ONE_PANE rows they get panes above and below the other devices. `ahead`: rows of the charts of bookings, 0 without.
-    `past`: seconds before the start from journals, 0 without; `only_past`: entities of devices known only from
-    these."""
+    """The content to lay out. `span`: start and end of a finished run, in seconds of the timeline; None for a live
+    layout, whose window follows the newest data. `wall`: the timeline has wall-clock times. `rc_rows`, `arc_rows` and
+    `host_rows`: rows expected in the upper panes, which share the height accordingly; 0 `host_rows`: no components; 0
+    `waiting_rows`: no pane of waiting requests. `banner`: a text above all panes. `contended` and `absent`: rows by
+    entity of devices that several requests want, and of absent ones; beyond ONE_PANE rows they get panes above and
+    below the others. `ahead`: rows of the charts of bookings, 0 without. `past`: seconds before the start from
+    journals, 0 without; `only_past`: entities of devices known only from these."""
 
     span: tuple[float, float] | None = None
     wall: bool = False
@@ -131,10 +127,9 @@ class Layout(msgspec.Struct, frozen=True):
 
 def blueprint(layout: Layout) -> rrb.Blueprint:
     """Lay out waiting requests, holders of devices and states of requests on one time axis, with events and loads
-    beside them; with components also the components of each host and their use, with the loads below.
-
-    Empty panes of devices or requests are left out beside components. With robots, behaviors follow the requests, loads
-    and hosts share a place, and floor and cameras are at the right, above the events."""
+    beside them; with components also those of each host and their use, with the loads below. Then empty panes of
+    devices or requests are left out. With robots, behaviors follow the requests, loads and hosts share a place, and
+    floor and cameras are at the right, above the events."""
     span, robots, host_rows = layout.span, layout.robots, layout.host_rows
     axis = rrb.archetypes.TimeAxis(view_range=_window(span))
     behavior_rows = LIVE_BEHAVIOR_ROWS if span is None and robots.behavior_rows else robots.behavior_rows
@@ -201,8 +196,8 @@ def _charts(rows: int) -> dict[str, tuple[int, rrb.View | rrb.Container]]:
 
 
 def _rc_panes(layout: Layout, axis: rrb.archetypes.TimeAxis) -> dict[str, tuple[int, rrb.View | rrb.Container]]:
-    """Views of devices with their share of the height, by title. A view sorts lanes by name, so contended devices have
-    a view of their own above the others, high enough for all."""
+    """Views of devices with their share of the height, by title. A view sorts lanes by name: contended devices have
+    their own above, high enough for all."""
     few = layout.rc_rows <= ONE_PANE
     contended, absent = ({}, {}) if few else (layout.contended, layout.absent)
     apart = {**contended, **absent}
@@ -230,7 +225,6 @@ def _rc_panes(layout: Layout, axis: rrb.archetypes.TimeAxis) -> dict[str, tuple[
 
 
 def _past(layout: Layout) -> rrb.View:
-    """The lanes of devices, including the past."""
     relative, absolute = rr.TimeRangeBoundary.cursor_relative, rr.TimeRangeBoundary.absolute
     if layout.span is None:
         window = rr.TimeRange(start=relative(seconds=-layout.past), end=relative(seconds=layout.past * MARGIN))

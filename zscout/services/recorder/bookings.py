@@ -44,7 +44,6 @@ class BookingTracker:
         self._stale = False
 
     def take(self, at: float, answer: BookingsTold) -> None:
-        """Take the list of all bookings."""
         self._received, self._zero = at, answer.time - at
         bookings = [booking for booking in answer.bookings if not booking.unbooked]
         if bookings != self._bookings:
@@ -53,7 +52,7 @@ class BookingTracker:
             self._draw(at)
 
     def tick(self, at: float) -> None:
-        """Update for the passing of time; called regularly."""
+        """Called regularly."""
         if self._bookings is not None and (at - self._drawn >= AGAIN or (at - self._received > STALE) != self._stale):
             self._draw(at)
 
@@ -85,8 +84,6 @@ class BookingTracker:
                 text = f"{text}, taken up"
             for rc in _rcs(booking, date):
                 yield Bar(rc, date.start, date.end, text, colour, thick=taken, hatched=booking.maintenance)
-
-    # Events
 
     def _log_changes(self, at: float, bookings: list[BookingView]) -> None:
         """Log changes as events. The first answer gives only warnings: the rest did not happen now."""

@@ -45,8 +45,8 @@ _UNKNOWN: Final = re.compile(
 
 
 class Drawing:
-    """One recording on one timeline, written to each of `streams`. `at` is in seconds, with an absolute value below
-    MAX_SECONDS, else ValueError is raised. Once `closed`, nothing is written."""
+    """One recording on one timeline, written to each of `streams`. `at`: seconds, below MAX_SECONDS in size, else
+    ValueError is raised. Once `closed`, nothing is written."""
 
     def __init__(self, *streams: rr.RecordingStream) -> None:
         self.streams = list(streams)
@@ -139,7 +139,6 @@ class Drawing:
         self.log(at, entity, rr.Clear(recursive=False))
 
     def curve(self, entity: str, name: str, colour: int, width: float, **more: Any) -> None:
-        """Set the line style of a curve."""
         self.log(None, entity, rr.SeriesLines(names=[clean_text(name)], colors=[colour], widths=[width], **more))
 
     def event(self, at: float, text: str, level: str = "INFO", *, operator: bool = False) -> None:
@@ -149,7 +148,6 @@ class Drawing:
         self.log(at, "events", rr.TextLog(clean_text(text, MAX_EVENT), level=level, color=colour))
 
     def warn(self, at: float, text: str, *, operator: bool = False) -> None:
-        """Log an event that needs attention."""
         self.event(at, text, "WARN", operator=operator)
 
     def presence(self, at: float, text: str, level: str = "INFO") -> None:
@@ -180,8 +178,8 @@ class Drawing:
 
 
 def unwritten(stream: rr.RecordingStream, path: Path, seconds: float) -> str:
-    """Why logged data is not in the file after `seconds`; empty if it is. Rerun's writer ends at its first error, and
-    only a flush shows that."""
+    """Why logged data is not in the file after `seconds`; or "". Rerun's writer ends at its first error, which only a
+    flush shows."""
     try:
         stream.flush(timeout_sec=seconds)
     except (RuntimeError, ValueError) as error:
@@ -194,8 +192,7 @@ def unwritten(stream: rr.RecordingStream, path: Path, seconds: float) -> str:
 
 
 def disconnect(stream: rr.RecordingStream, seconds: float) -> bool:
-    """End a stream; return True if that took at most `seconds`. A hanging viewer can block it: then a daemon thread
-    keeps waiting."""
+    """Return True if that took at most `seconds`. A hanging viewer can block it: then a daemon thread keeps waiting."""
     thread = threading.Thread(target=stream.disconnect, name="rerun-disconnect", daemon=True)
     thread.start()
     thread.join(seconds)
@@ -228,10 +225,9 @@ class _Lane:
 
 
 class Lanes:
-    """The lanes in one folder, at most `limit`; `others` ends the note that there are more.
-
-    `colours`: texts of a lane that keep their colour; beyond it the least recently used loses its colour. `depth`:
-    parts of a name, separated by `/`, that become parts of the entity. `slots`: the most rows of a lane."""
+    """The lanes in one folder, at most `limit`; `others` ends the note that there are more. `colours`: texts of a lane
+    that keep their colour; beyond it the least recently used loses its colour. `depth`: parts of a name, separated by
+    `/`, that become parts of the entity. `slots`: the most rows of a lane."""
 
     def __init__(
         self,

@@ -38,8 +38,7 @@ class Job(msgspec.Struct, frozen=True):
 
 
 def finish(path: Path, layout: Layout, *, whole: float = WHOLE) -> None:
-    """Rewrite a recording in place. On failure raises OSError, RuntimeError or ValueError, and leaves the file as it
-    was."""
+    """Rewrite a recording in place. On failure raises OSError, RuntimeError or ValueError; the file stays as it was."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # a live recording has no footer
         reader = RrdReader(path)

@@ -258,8 +258,6 @@ class FloorPlan:
         strips = [[spot for _, spot in self._trails[name]] for name in shown]
         self._draw(at, "trails", strips, [faded(colours[name], 0.55) for name in shown])
 
-    # From metres to pixels
-
     def _is_near(self, placed: Placed) -> bool:
         width, depth = self._metres
         return (

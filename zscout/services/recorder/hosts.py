@@ -63,8 +63,6 @@ class _Host:
 
 @dataclass(slots=True)
 class _Marked:
-    """The latest stack of marks of a host: time, number, and height of the first."""
-
     at: float
     count: int
     height: float
@@ -90,11 +88,9 @@ class HostTracker:
         """Components, the least recently changed first."""
         self._cordoned: frozenset[str] = frozenset()
 
-    # Loads and marks
-
     def load(self, at: float, host: str, load1: float, cpu: float | None = None) -> None:
-        """Draw a host's load average over 1 minute and, under `/cpu`, its CPU use (0 to 1). Values that are not finite
-        leave a gap."""
+        """A host's load average over 1 minute and, under `/cpu`, its CPU use (0 to 1); values that are not finite leave
+        a gap."""
         entities = clean_path("load", host), clean_path("cpu", host)
         known = self._hosts.get(host)
         if known is None:
@@ -115,7 +111,6 @@ class HostTracker:
             known.load, self._peak = load1, max(self._peak, load1)
 
     def mark(self, at: float, host: str, mark: Mark, component: str) -> None:
-        """Mark an event of a component on the host's load curve."""
         entity = f"/mark/{mark}"
         if mark not in self._looks:
             self._looks.add(mark)
@@ -171,12 +166,9 @@ class HostTracker:
         for entity in _entities(key):
             self._drawing.erase(at, entity)
 
-    # Placements
-
     def placements(self, at: float, news: Placements, fresher: set[str] | None = None) -> None:
-        """Take changed placements; with `fresher`, the answer to a query for all. `fresher` names components published
-        since that query, which are ignored in the answer. New components in an answer are shown, but did not happen
-        now."""
+        """Take changed placements; with `fresher`, the answer to a query for all, except the components published
+        since, which `fresher` names. New ones in an answer are shown, but did not happen now."""
         if news.term < self._term or absurd(news.term, self._term):
             return
         self._term = news.term
@@ -200,7 +192,6 @@ class HostTracker:
             self._drawing.event(at, f"{host} is used again")
 
     def _show_lane(self, at: float, host: str) -> None:
-        """Show a row for each component on the host."""
         self.placing = True
         self._drawing.arrange()
         shown = dict[str, tuple[str, int]]()
@@ -212,7 +203,7 @@ class HostTracker:
         self.lanes.show(at, host, shown)
 
     def _take(self, at: float, now: Placement, *, news: bool) -> set[str]:
-        """Take a placement; return the hosts whose lanes change."""
+        """Return the hosts whose lanes change."""
         names = (now.component, *(host for host in (now.host, now.to) if host is not None))
         if not all(NAME.fullmatch(name) for name in names):
             log.warning("the placer published a component or host with a bad name: %.200r", names)
@@ -230,7 +221,6 @@ class HostTracker:
         return {*_seats(now), *(_seats(before) if before is not None else ())}
 
     def _log_change(self, at: float, known: _Component, before: Placement | None, *, news: bool) -> None:
-        """Log the event of a change, and its marks."""
         now, name = known.placement, known.placement.component
         event, warn, mark = self._drawing.event, self._drawing.warn, self.mark
         why = f": {now.reason}" if now.reason else ""

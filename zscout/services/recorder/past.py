@@ -71,8 +71,8 @@ def _at(seconds: float) -> str:
 def past_lanes(
     holds: Iterable[PastHold], unknown: Sequence[Span], window: Span, zero: float, operator_priority: int
 ) -> Mapping[str, PastLane]:
-    """The lane of each RC within the window. `unknown`: periods that no journal covers completely, sorted and disjoint,
-    in which an RC without a known hold is not known to be free. Second 0 is `zero`."""
+    """The lane of each RC within the window; second 0 is `zero`. `unknown`: periods, sorted and disjoint, that no
+    journal covers completely; in them an RC without a known hold is not known to be free."""
     bars: dict[str, list[tuple[Span, PastBar]]] = {}
     for hold in holds:
         span = Span(

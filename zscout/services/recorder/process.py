@@ -110,8 +110,8 @@ def writing(path: Path) -> Iterator[None]:
 
 
 def prune(folder: Path, fleet: str, keep: int = KEEP, limit: int | None = None) -> None:
-    """Remove the oldest recordings of a fleet until at most `keep` are left, with `limit` bytes in total. Recordings
-    being written are kept. Only files named as by `new_recording` are removed."""
+    """Remove the oldest recordings of a fleet until at most `keep` are left, with `limit` bytes in total. Not removed:
+    recordings being written, files not named by `new_recording`."""
     name = rf"{re.escape(fleet)}-\d{{8}}-\d{{6}}(-\d+)?"
     ours, half_done = re.compile(rf"{name}\.rrd"), re.compile(rf"\.{name}\.finishing")
     try:

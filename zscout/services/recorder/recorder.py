@@ -78,10 +78,8 @@ class RecorderFailed(RuntimeError):
 
 
 class Recorder:
-    """Records one fleet to `timeline`, in seconds since this object was created.
-
-    At most `frames` pictures a second of each camera are recorded. With 0 there are no subscriptions to pictures, so
-    framegrabbers need not publish any."""
+    """Records one fleet to `timeline`, in seconds since this object was created: at most `frames` pictures a second of
+    each camera; 0: no subscriptions to pictures, so framegrabbers need not publish any."""
 
     def __init__(
         self,
@@ -94,7 +92,7 @@ class Recorder:
         wall: Callable[[], float] = time.time,
     ) -> None:
         """`where` answers queries for the place of the recording; without it there are no answers. `past`: seconds
-        before this object was created, for which journals are queried. `wall`: seconds since 1970, UTC."""
+        before this object's creation, from journals. `wall`: seconds since 1970, UTC."""
         self.mesh, self.timeline, self.frames, self._where = mesh, timeline, frames, where
         self.fleet, self.past, self._wall = fleet, past, wall
         self._zero, self._epoch = mesh.now(), wall()
@@ -113,8 +111,8 @@ class Recorder:
         self._asking: asyncio.Task[None] | None = None
 
     async def run(self, stop: asyncio.Event) -> None:
-        """Record until `stop`, which a failure sets too. Declare the liveliness token once an RCM's whole state was
-        read. Raises RecorderFailed."""
+        """Record until `stop`, which a failure sets too; the token shows that an RCM's whole state was read. Raises
+        RecorderFailed."""
         self._supervisor = Supervisor("the recorder", lambda _: stop.set())
         keys, subscribe, guard = self.mesh.keys, self.mesh.subscribe, self._supervisor.guard
         self._declared = [
@@ -215,8 +213,6 @@ class Recorder:
             # The leader decides its holders, and whether it is present.
             self._wanted.set()
 
-    # The whole state, where something was missed
-
     async def _keep_reading(self) -> None:
         known, read_at = 0, 0.0
         while True:
@@ -270,8 +266,6 @@ class Recorder:
             self._fresher.update(placement.component for placement in news.components)
             self._fresher.update(news.forgotten)
         self._hosts.placements(self.now(), news)
-
-    # Bookings, and the past
 
     async def _keep_asking_for_bookings(self) -> None:
         """Query bookings periodically. Does not return."""
@@ -327,8 +321,6 @@ class Recorder:
         else:
             text = "Catching up: no leader is seen yet. Devices and requests appear as soon as one leads."
         self.timeline.banner(text)
-
-    # Robots
 
     async def _tick(self) -> None:
         while True:

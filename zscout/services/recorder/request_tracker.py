@@ -57,8 +57,6 @@ class _Request:
 
 
 class RequestTracker:
-    """Writes the holders of devices and the states of ARCs to `timeline`."""
-
     def __init__(self, timeline: Timeline, operator_priority: int) -> None:
         self.timeline, self.operator_priority = timeline, operator_priority
         self.term: Term = NO_TERM
@@ -87,7 +85,6 @@ class RequestTracker:
         return missed
 
     def notice(self, at: float, notice: Notice) -> None:
-        """Take the notice of a request."""
         if notice.term < self.term:
             return
         key = (notice.client, notice.id)
@@ -269,7 +266,6 @@ class RequestTracker:
         return f"for {', '.join(others)}: {'; '.join(filter(None, wanted))}{more}"
 
     def _named(self, reason: str, why: ReasonInfo | None) -> str:
-        """The reason, with the names of requests' lanes."""
         return str(reason_of(why, self._label) or reason)
 
     def _label(self, view: Holder | HoldView | ReasonParty) -> str:

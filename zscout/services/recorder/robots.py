@@ -67,8 +67,7 @@ class _Sender:
 
 
 class RateLimiter:
-    """Passes on reports, at most `RATE` a second of each sender. Further reports wait, of each path only the newest, so
-    that the last one passed on is always up to date."""
+    """Passes on at most `RATE` reports a second of each sender. Of further ones the newest of each path waits."""
 
     def __init__(self) -> None:
         self._senders: dict[Sender, _Sender] = {}
@@ -134,8 +133,6 @@ class _Camera:
 
 
 class RobotTracker:
-    """Draws the publications about robots and devices."""
-
     def __init__(self, drawing: Drawing) -> None:
         self._drawing = drawing
         self.floor = FloorPlan(drawing, self._look)
@@ -158,7 +155,7 @@ class RobotTracker:
         return RobotLayout(tuple(cameras), self.floor.size, self._behaviors.rows, min(len(self._figures), LEGEND + 1))
 
     def tick(self, at: float) -> None:
-        """Update for the passing of time; called several times a second."""
+        """Called several times a second."""
         for sender, report in list(self._limiter.due(at)):
             self._take(at, sender, report)
         for sender, count in self._limiter.dropped(at):
@@ -166,8 +163,6 @@ class RobotTracker:
         for rc, health in self._health.items():
             self._show_health(at, rc, health)
         self.floor.tick(at)
-
-    # Behaviors
 
     def behavior(self, at: float, sender: Sender, report: BehaviorSaid) -> None:
         if self._limiter.offer(at, sender, report):
@@ -211,7 +206,6 @@ class RobotTracker:
         self._drawing.arrange()
 
     def _doing(self, robot: str) -> BehaviorSaid | None:
-        """The newest report about a robot."""
         names = robot, f"robot/{robot}"
         return next((report for report in reversed(self._reports.values()) if report.robot in names), None)
 
@@ -220,8 +214,6 @@ class RobotTracker:
             return Look("operator", OPERATOR)
         report = self._doing(robot)
         return Look(report.doing, alert=report.alert or report.doing == "alert") if report is not None else Look()
-
-    # Cameras
 
     def frame(self, at: float, camera: str, head: FrameHead, jpeg: bytes) -> None:
         seen = self._cameras.get(camera)
@@ -297,7 +289,6 @@ class RobotTracker:
         )
 
     def _draw_boxes(self, at: float, seen: _Camera) -> None:
-        """Draw the boxes over the camera's pictures, in pixels, from `at` on."""
         boxes = [box for some in seen.boxes.values() for box in some][:MAX_BOXES]
         self._drawing.show(
             at,
@@ -308,8 +299,6 @@ class RobotTracker:
             colors=[ALERT],
             radii=[-1.5],
         )
-
-    # Devices
 
     def state(self, at: float, state: RcState) -> None:
         """Take the state of an RC: figures and health of its device, or that it is on standby."""
@@ -342,7 +331,7 @@ class RobotTracker:
             self._drawing.event(at, f"{rc} is well again")
 
     def _draw_figures(self, at: float, rc: str, figures: Mapping[str, float]) -> None:
-        """Draw figures as curves, without values that are not finite."""
+        """Leaves out values that are not finite."""
         for figure, value in figures.items():
             key = rc, figure
             drawn_at, last = self._figures.get(key, (-math.inf, math.nan))

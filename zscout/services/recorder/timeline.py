@@ -81,12 +81,10 @@ class TimelineError(BadInput):
 
 
 class Timeline(Drawing):
-    """The Rerun side of a recorder. After `close` every call does nothing.
-
-    `fleet` names the recording, together with the time of the start. `path`: the `.rrd` file, replaced if it exists,
-    or None. `port`: the live server's TCP port on the IP address `bind`, 0 for a free port, or None for no server. File
-    or server is required. `wall`: the timeline has wall-clock times, once `start_clock` was called. Raises
-    TimelineError if the port is taken or the file can't be written."""
+    """The Rerun side of a recorder. After `close` every call does nothing. `fleet` names the recording, together with
+    the time of the start. `path`: the `.rrd` file, replaced if it exists. `port`: the live server's TCP port on the IP
+    address `bind`, 0 for a free port. One of both is required. `wall`: the timeline has wall-clock times, once
+    `start_clock` was called. Raises TimelineError if the port is taken or the file can't be written."""
 
     def __init__(
         self, fleet: str, *, path: Path | None, bind: str = "127.0.0.1", port: int | None = None, wall: bool = False
@@ -180,9 +178,8 @@ class Timeline(Drawing):
                 stream.send_recording_start_time_nanos(round(epoch * 1e9))
 
     def roll(self, at: float, path: Path) -> Job | None:
-        """Continue in another file, which starts with the present state. Return the job to finish the previous file,
-        None if that could not be written. Raises TimelineError if the new file can't be written, and changes
-        nothing."""
+        """Continue in another file, which starts with the present state. Return the job to finish the previous file;
+        None: that was not written. Raises TimelineError, and changes nothing, if the new file can't be written."""
         before, old, layout = self._file, self._path, self.layout(live=False)
         if before is None or old is None or self.closed:
             return None
@@ -204,9 +201,7 @@ class Timeline(Drawing):
 
     def holders(self, at: float, rc: str, holders: Sequence[HolderRow], absent: str = "") -> None:
         """From `at` on, the device (`kind/name`) is held by exactly these requests. `absent`: the text for an absent
-        device.
-
-        Each holder gets a row with its request's name, and `OPERATOR_MARK` for an operator."""
+        device. Each holder gets a row with its request's name, and `OPERATOR_MARK` for an operator."""
         entity = self._rc_lanes.entity(rc)
         (self._absent.add if absent else self._absent.discard)(entity)
         shown: dict[str, tuple[str, int]] = {absent: (clean_text(absent), ABSENT)} if absent and not holders else {}
@@ -239,7 +234,7 @@ class Timeline(Drawing):
                 self._contended[entity] = at
 
     def regroup(self, at: float) -> None:
-        """Update for the passing of time; called regularly."""
+        """Called regularly."""
         self.pass_points(at)
         if at - self._grouped >= REGROUP:
             self._grouped = at
@@ -254,11 +249,9 @@ class Timeline(Drawing):
         return tuple(sorted(contended)), tuple(sorted(self._absent))
 
     def arc(self, at: float, arc: str, state: str, detail: str = "", *, operator: bool = False) -> None:
-        """From `at` on, the request is in `state`: "waiting", "running", "preempted", "done" or another word.
-
-        `arc` is its name, with the person in parentheses: the lane is then `person/name`. `detail` is added to the same
-        bar, such as why it waits. An empty `state` ends the lane. An `operator`'s running request has an operator's
-        colour."""
+        """From `at` on, the request is in `state`: "waiting", "running", "preempted", "done" or another word. `arc`:
+        its name, with the person in parentheses; the lane is then `person/name`. `detail`, such as why it waits, is
+        added to the bar. An empty `state` ends the lane. An `operator`'s running request has an operator's colour."""
         own = self._colour(at, arc)
         if arc not in self._arcs:
             return
@@ -288,9 +281,8 @@ class Timeline(Drawing):
             self.arrange()
 
     def close(self) -> None:
-        """End file and server within seconds. The file then opens on the whole run.
-
-        Raises TimelineError if not everything could be written."""
+        """End file and server within seconds; the file then opens on the whole run. Raises TimelineError if not all was
+        written."""
         if self.closed:
             return
         self.closed = True
@@ -315,7 +307,6 @@ class Timeline(Drawing):
                 log.warning("the recording %s stays as it was written, and opens slowly: %s", self._path, error)
 
     def _finish(self, path: Path, layout: Layout) -> None:
-        """Finish a complete file."""
         finish(path, layout)
 
     def _end(self) -> bool:
@@ -380,8 +371,8 @@ class Timeline(Drawing):
         return self._colour_of(arc)
 
     def _colour_of(self, arc: str) -> int:
-        """The first request of a name shares its colour with a component or booking of that name. A new name gets the
-        next colour among those that the fewest open requests have."""
+        """A component or booking shares the colour of the first request of its name. A new name gets the next colour
+        among those that the fewest open requests have."""
         name = arc.partition(" (")[0]
         if self._namesakes.get(name, name) == name and len(self._namesakes) < MAX_COLOURS:
             self._namesakes[name] = arc
