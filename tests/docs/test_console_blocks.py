@@ -1,4 +1,5 @@
-"""Commands of the how-tos, run on a live fleet: each prints what its page shows, but for times, ids and figures."""
+"""Commands of the README, the tutorial and the how-tos, run on a live fleet: each prints what its page shows, but for
+times, ids and figures."""
 
 from __future__ import annotations
 
@@ -6,28 +7,104 @@ import re
 import shlex
 from collections import Counter
 from collections.abc import Iterator
+from datetime import datetime, timedelta
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 import pytest
 
-from tests.cli.cli_fleet import CliFleet
+from tests.cli import tools
+from tests.cli.cli_fleet import NOBODY_THERE, CliFleet
+from tests.docs.test_coming_from_labgrid import Shell
 
 pytestmark = [pytest.mark.live, pytest.mark.slow, pytest.mark.plain_only("the pages show the names of a plain fleet")]
-DOCS: Final = Path(__file__).parents[2] / "docs"
+ROOT: Final = Path(__file__).parents[2]
+
+
+class Block(NamedTuple):
+    """A block of a page, and how its commands are run."""
+
+    page: str
+    words: str
+    """In this block, and in none before it on the page."""
+    requests: tuple[str, ...] = ()
+    """Present before the block: user, then the arguments of `zscout request --name`. The second waits for the first."""
+    user: str = "ada"
+    terminal: bool = False
+    """At a terminal, as its tables are narrow there."""
+    bash: bool = False
+    """In one shell, in the fleet's folder: for variables and for other programs."""
+
+
+SURVEY: Final = "ada survey robot/scout33 radio/rf0:command_rate=6 -- sleep 600"
+CHAT: Final = "bob chat radio/rf0:command_rate=6 -- echo my turn"
+ARM: Final = "ada survey robot/arm1 -- sleep 600"
+TUTORIAL: Final = "ada survey robot/scout33 radio/rf0:command_rate=6 --min-runtime 5m -- sleep 600"
 BLOCKS: Final = [
-    ("how-to/share-devices.md", "I hold $ZSCOUT_RCS"),
-    ("how-to/share-devices.md", "echo $ZSCOUT_BOUND"),
-    ("how-to/book-devices.md", "--name survey"),
-    ("how-to/book-devices.md", "--every week"),
-    ("how-to/see-who-held-what.md", "history --since 7d"),
-    ("components.md", "component start counter"),
+    Block("docs/tutorial.md", "zscout-node"),
+    Block("docs/tutorial.md", "I hold $ZSCOUT_RCS"),
+    Block(
+        "docs/tutorial.md",
+        "zscout why chat",
+        (TUTORIAL, "ada chat radio/rf0:command_rate=6 -- sleep 20"),
+        terminal=True,
+    ),
+    Block("docs/tutorial.md", "zscout take", (TUTORIAL,)),
+    Block("README.md", "I hold $ZSCOUT_RCS"),
+    Block("README.md", "echo my turn", (SURVEY,), "bob"),
+    Block("README.md", "zscout status", (SURVEY, CHAT), "eve", terminal=True),
+    Block("README.md", "zscout why chat", (SURVEY, CHAT), "eve"),
+    Block("docs/how-to/share-devices.md", "I hold $ZSCOUT_RCS"),
+    Block("docs/how-to/share-devices.md", "echo $ZSCOUT_BOUND"),
+    Block("docs/how-to/share-devices.md", "zscout why chat", (SURVEY, CHAT), "bob"),
+    Block("docs/how-to/share-devices.md", "--reason", (SURVEY,), "eve"),
+    Block("docs/how-to/share-devices.md", "zscout release", (SURVEY,), "eve"),
+    Block("docs/how-to/run-a-fleet.md", "zscout-node"),
+    Block("docs/how-to/run-a-fleet.md", "zscout doctor"),
+    Block("docs/how-to/run-a-fleet.md", "zscout drain", (ARM,), "eve", bash=True),
+    Block("docs/how-to/book-devices.md", "--name survey"),
+    Block("docs/how-to/book-devices.md", "./survey.py"),
+    Block("docs/how-to/book-devices.md", "--every week"),
+    Block("docs/how-to/calendars.md", "zscout booking export", bash=True),
+    Block("docs/how-to/calendars.md", "--dry-run", bash=True),
+    Block("docs/how-to/calendars.md", "curl", bash=True),
+    Block("docs/how-to/book-devices.md", "new grippers", (ARM,), "eve"),
+    Block("docs/how-to/book-devices.md", "--broken", (), "eve"),
+    Block("docs/how-to/secure-a-fleet.md", "zscout cert ca", bash=True),
+    Block("docs/how-to/secure-a-fleet.md", "zscout cert show", bash=True),
+    Block("docs/how-to/secure-a-fleet.md", "zscout cert renew", bash=True),
+    Block("docs/how-to/secure-a-fleet.md", "zscout cert ca new-ca", bash=True),
+    Block("docs/how-to/use-in-ci.md", "zscout request dut/board"),
+    Block("docs/how-to/use-in-ci.md", "zscout acquire", bash=True),
+    Block("docs/how-to/use-in-ci.md", "zscout book"),
+    Block("docs/how-to/use-in-ci.md", "./nightly.sh"),
+    Block("docs/how-to/see-who-held-what.md", "history --since 7d"),
+    Block("docs/troubleshooting.md", "robot/arn1"),
+    Block("docs/troubleshooting.md", "zscout why survey", (ARM,)),
+    Block("docs/simulation.md", "zscout simulate --list"),
+    Block("docs/components.md", "component start counter"),
 ]
-"""Pages, and words of the block, in an order in which they can be run."""
+"""In an order in which they can be run."""
 VARIES: Final = re.compile(
-    r"\b(?:Mon|Tue|Wed|Thu|Fri|Sat|Sun)\b|\b(?:[0-9a-f]{8})\b|\([\w/]+/[\w/]+\)|[\d.,:-]*\d|\b(?:d|h|min|s|MiB|GiB)\b"
+    r"\b(?:Mon|Tue|Wed|Thu|Fri|Sat|Sun)\b|-?\b(?:[0-9a-f]{8}|[0-9a-f]{12})\b|\([\w/]+/[\w/]+\)|[\d.,:-]*\d"
+    r"|\b(?:d|h|min|s|MiB|GiB)\b|\.\.\.|…|[,;:()]"
 )
-"""Days, ids, zones, numbers and units."""
+"""Days, ids, zones, numbers, units and punctuation."""
+WAITS: Final = re.compile(r"^\S+ waits\b", re.MULTILINE)
+DEVICES: Final = (
+    "robot/arm1",
+    "robot/scout33",
+    "framegrabber/fg1",
+    "radio/rf0:command_rate=10.0",
+    "dut/board",
+    "dut/one",
+    "camera/bench",
+)
+COLUMNS: Final = 110
+SCRIPTS: Final = ("survey.py", "test.sh", "flash.sh", "nightly.sh")
+"""Programs of the reader, which do nothing here."""
+ELSEWHERE: Final = ("ssh", "scp", "systemctl")
+"""Programs that would reach other hosts, or this one's: they do nothing here."""
 
 
 @pytest.fixture(scope="module")
@@ -35,34 +112,126 @@ def fleet(tmp_path_factory: pytest.TempPathFactory, fleet_kind: str) -> Iterator
     fleet = CliFleet(tmp_path_factory.mktemp("pages"))
     fleet.lab.env |= {"LOGNAME": "ada", "ZSCOUT_HOST": "anvil"}
     try:
-        fleet.lab.node(
-            "anvil", "robot/arm1", "robot/scout33", "framegrabber/fg1", "radio/rf0:command_rate=10.0",
-            extra='state = "journal"',
-        )  # fmt: skip
-        names = {"robot/arm1", "robot/scout33", "framegrabber/fg1", "radio/rf0"}
+        fleet.lab.node("anvil", *DEVICES, extra='state = "journal"')
+        names = {device.partition(":")[0] for device in DEVICES}
         fleet.state(lambda state: {view.rc for view in state.rcs if view.present} == names)
         fleet.balanced("anvil")
+        (fleet.folder / "lab.ics").write_text(calendar())
+        for script in SCRIPTS:
+            (fleet.folder / script).write_text("#!/bin/sh\n")
+            (fleet.folder / script).chmod(0o755)
         yield fleet
     finally:
         fleet.close()
 
 
+def calendar() -> str:
+    """A calendar with an event for a device and one for none, in nine days."""
+    day = datetime.now().astimezone() + timedelta(days=9)
+    events = (
+        f"BEGIN:VEVENT\nUID:{number}\nSUMMARY:{title}\nDTSTART:{day:%Y%m%d}T170000\nDURATION:PT1H\nEND:VEVENT\n"
+        for number, title in enumerate(("Arm 1 class", "Lunch"))
+    )
+    return f"BEGIN:VCALENDAR\n{''.join(events)}END:VCALENDAR\n"
+
+
 def plain(text: str) -> list[str]:
     """The words alone: tables have other widths, lines other ends, and both streams their own order."""
-    return VARIES.sub(" ", text).replace("...", " ").split()
+    return VARIES.sub(" ", text).split()
+
+
+def missing(shown: str, printed: str) -> list[str]:
+    """Words that a page shows and a command did not print."""
+    return sorted((Counter(plain(shown)) - Counter(plain(printed))).elements())
 
 
 def sessions(page: str, words: str) -> list[tuple[str, str]]:
     """The commands of the block with these words, each with its output."""
-    blocks = re.findall(r"^```console\n(.*?)^```", (DOCS / page).read_text(), re.MULTILINE | re.DOTALL)
+    blocks = re.findall(r"^```console\n(.*?)^```", (ROOT / page).read_text(), re.MULTILINE | re.DOTALL)
     block = next(block for block in blocks if words in block)
-    return re.findall(r"^\$ (.*)\n((?:(?!\$ ).*\n)*)", block, re.MULTILINE)
+    found = re.findall(r"^\$ (.*(?:(?<=\\)\n> .*)*)\n((?:(?!\$ ).*\n)*)", block, re.MULTILINE)
+    return [(command.replace("\\\n> ", ""), output) for command, output in found]
 
 
-@pytest.mark.parametrize(("page", "words"), BLOCKS)
-def test_a_command_prints_what_its_page_shows(page: str, words: str, fleet: CliFleet) -> None:
-    for command, output in sessions(page, words):
-        done = fleet.zscout(*shlex.split(command)[1:])
-        output = output.replace("Fleet lab:", f"Fleet {fleet.lab.fleet.name}:")
-        missing = Counter(plain(output)) - Counter(plain(done.stdout + done.stderr))
-        assert missing == Counter(), (command, done)
+class Runner:
+    """Runs the commands of one block."""
+
+    def __init__(self, fleet: CliFleet, block: Block) -> None:
+        self._fleet, self._terminal = fleet, block.terminal
+        fleet.lab.env["LOGNAME"] = block.user
+        self._shell = Shell(block.user, dict(fleet.lab.env)) if block.bash else None
+        if self._shell is not None:
+            self._shell.type(f"export ZSCOUT_HOST=anvil; cd {shlex.quote(str(fleet.folder))}")
+            for program in ELSEWHERE:
+                self._shell.type(f"{program}() {{ :; }}")
+            self._shell.type("curl() { cat lab.ics; }")
+
+    def run(self, command: str, output: str) -> str:
+        """What a command prints, to its end; one that waits on its page is ended when it says so."""
+        command = re.sub(r"\bsleep \d+", "sleep 0", command).replace(" ./", f" {self._fleet.folder}/")
+        if self._shell is not None:
+            return self._in_shell(self._shell, command)
+        if command.startswith("zscout-node "):  # it runs already
+            return self._fleet.lab.log("anvil")
+        args = shlex.split(command, comments=True)[1:]
+        if self._terminal or "[y/N] y" in output:
+            return self._at_a_terminal(output, *args)
+        if WAITS.search(output):
+            process, lines = self._fleet.begun(" waits", *args)
+            tools.end(process)
+            return "\n".join(lines)
+        done = self._fleet.zscout(*args)
+        return done.stdout + done.stderr
+
+    def _at_a_terminal(self, output: str, *args: str) -> str:
+        with tools.Terminal(*args, env=self._fleet.lab.env, columns=COLUMNS) as terminal:
+            if "[y/N] y" in output:
+                terminal.until("[y/N]")
+                terminal.press("y\n")
+            terminal.code()
+            return terminal.text
+
+    def _in_shell(self, shell: Shell, command: str) -> str:
+        """Repeats a command that saw no leader: it has done nothing."""
+        while True:
+            shell.type(f"{command}\necho :end:$?")
+            lines = []
+            while not (line := shell.output.readline()).startswith(":end:"):
+                assert line, f"the shell ended at {command}"
+                lines.append(line)
+            if line != f":end:{NOBODY_THERE}\n":
+                return "".join(lines)
+
+    def close(self) -> None:
+        self._fleet.end_started()
+        if self._shell is not None:
+            self._shell.close()
+
+
+def begin(fleet: CliFleet, request: str, until: str) -> None:
+    """Starts a request of a block's beginning; returns when it has printed `until`."""
+    user, name, *args = shlex.split(request)
+    fleet.lab.env["LOGNAME"] = user
+    fleet.begun(f"{name} {until} ", "request", "--name", name, *args)
+
+
+def played(fleet: CliFleet, block: Block) -> Iterator[tuple[str, str, str]]:
+    """Each command of a block, what its page shows, and what it printed."""
+    for request, until in zip(block.requests, ("holds", "waits for"), strict=False):
+        begin(fleet, request, until)
+    runner = Runner(fleet, block)
+    try:
+        for command, shown in sessions(block.page, block.words):
+            output = re.sub(r"\b([Ff]leet) (lab|zscout)\b", rf"\1 {fleet.lab.fleet.name}", shown)
+            output = output.replace("(fleet.toml)", str(fleet.lab.fleet_file)).replace("on eth0", "on lo")
+            yield command, output, runner.run(command, output)
+    finally:
+        runner.close()
+        fleet.idle(*(device.partition(":")[0] for device in DEVICES))
+
+
+@pytest.mark.parametrize("block", BLOCKS, ids=lambda block: f"{Path(block.page).stem}: {block.words}")
+def test_a_command_prints_what_its_page_shows(block: Block, fleet: CliFleet) -> None:
+    for command, output, printed in played(fleet, block):
+        assert missing(output, printed) == [], (command, printed)
+        assert output or not printed, (command, printed)

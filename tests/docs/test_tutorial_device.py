@@ -12,6 +12,7 @@ import pytest
 from hatchling.build import build_wheel
 
 from tests.cli import tools
+from tests.docs.test_console_blocks import missing, sessions
 from tests.hang import HANG
 from tests.live.lab import Lab
 from tests.live.test_recorder import ended, recording, the_file, until
@@ -61,10 +62,11 @@ def test_a_device_of_ones_own_is_held_commanded_and_on_the_timeline(
     for name, text in files().items():
         Path(name).parent.mkdir(exist_ok=True)
         Path(name).write_text(text)
-    install, touch, node, request, blink, view = commands()
-    assert (install, touch, node, blink) == (
-        "pip install ./lamp", "touch brightness", "zscout-node node.toml", "python blink.py"
-    )  # fmt: skip
+    install, touch, node, view = commands()
+    assert (install, touch, node) == ("pip install ./lamp", "touch brightness", "zscout-node node.toml")
+    ((request, reading),) = sessions("docs/tutorial-device.md", "zscout request")
+    ((blink, blinking),) = sessions("docs/tutorial-device.md", "blink.py")
+    assert blink == "python blink.py"
     assert view.startswith("zscout view")
     # What pip does, into a folder of its own: this environment belongs to others.
     with monkeypatch.context() as patch:
@@ -98,11 +100,12 @@ def test_a_device_of_ones_own_is_held_commanded_and_on_the_timeline(
             ask = ("request", "lamp/desk", "--name", "reading", "--", "sh", "-c", script)
             held = await tools.zscout_soon_until(lambda done: done.returncode != 3, *ask, env=lab.env)
             assert (held.returncode, held.stdout.splitlines()[-1:]) == (0, ["I hold lamp/desk"]), held.stderr
+            assert missing(reading, held.stdout + held.stderr) == []
 
             blink_py = (sys.executable, "blink.py")
             blinked = await asyncio.to_thread(tools.program_until_in_time, *blink_py, env=lab.env)
             assert blinked.returncode == 0, blinked.stderr
-            assert blinked.stdout == blocks("text")[0]
+            assert blinked.stdout == blinking
             await lab.held_by(client, "lamp/desk")
             await until(lambda: lamp.read_text() == "0\n")
             async with asyncio.timeout(HANG):
