@@ -1,5 +1,5 @@
-"""A client and resource controllers written from `docs/protocol.md` alone, with plain `zenoh` and `json`: nothing of
-the project. Section names in quotes are that page's.
+"""A client and resource controllers written from the pages of `docs/protocol` alone, with plain `zenoh` and `json`:
+nothing of the project. Quotes name sections of these pages.
 
     python -m studies.chaos.foreign client|rcs FLEET HOST SEED"""
 
@@ -20,7 +20,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
-# "Joining": with few receiving threads one host that is cut off stalls every link.
+# "Joining a fleet": with few receiving threads one host that is cut off stalls every link.
 os.environ["ZENOH_RUNTIME"] = (
     "(rx:(worker_threads:16),net:(worker_threads:4),acc:(worker_threads:4),tx:(worker_threads:4),app:(worker_threads:2))"
 )
@@ -385,7 +385,7 @@ class Rc:
         self.trace("end")
         self.publish(endings)
 
-    # "Commands", "Votes", "State"
+    # "Checking a command", "Votes", "State"
 
     def on_command(self, query: zenoh.Query) -> None:
         try:
@@ -620,7 +620,7 @@ class Client(Peer):
             self.news.notify_all()
 
     def on_requests(self, query: zenoh.Query) -> Json:
-        """ "When an RCM takes the lead"."""
+        """List the open requests, and promise the term ("When an RCM takes the lead")."""
         with self.lock:
             promise = payload_of(query).get("promise")
             if promise is not None:
@@ -677,7 +677,7 @@ class Client(Peer):
         return code
 
     def confirm(self, request: Request, grant: Any) -> bool:
-        """ "Entering"."""
+        """Confirm a grant at all its RCs; return True if all have ("Entering")."""
         refused: list[str] = []
         until = now() + SECOND
 
@@ -828,7 +828,7 @@ def main() -> None:
     program = "program" if what == "client" else "rcs"
 
     def join() -> zenoh.Session:
-        """ "Joining": its id is greater than the ids of earlier sessions."""
+        """Open a session with a greater id than earlier sessions ("Joining a fleet")."""
         config.insert_json5("id", f'"1{secrets.token_hex(9)}0{time.time_ns().to_bytes(8, "little").hex()[4:]}"')
         return zenoh.open(config)
 

@@ -24,7 +24,7 @@ def placement(seeds: range, as_json: bool, rrd: Path | None) -> None:
     Three Place Sensor Nets on three workstations, started at once and a minute apart (Figure 3 of the paper),
     under every policy; a mixed batch on machines of unlike speed and memory under every metric; and the metric
     that `auto` learns if a single figure decides. A seed gives the same result on every machine. The results are
-    in docs/placement.md.
+    in docs/evaluation.
 
     \b
     Examples:

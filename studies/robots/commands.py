@@ -73,7 +73,7 @@ def robots(
     By number of robots and of video channels with a framegrabber each; by number of framegrabbers, and by rate of
     the radio, with four robots and four channels; and by length of the turns, with four robots on one channel. If
     any of --robots, --channels, --framegrabbers, --baud and --slot is given, only these are tried. Controllers, votes
-    and scheduling are the real code; the mesh is left out, and time is virtual. The results are in docs/robots.md.
+    and scheduling are the real code; the mesh is left out, and time is virtual. The results are in docs/evaluation.
 
     \b
     Examples:

@@ -253,7 +253,7 @@ def traces(
 
     The strategies are compared with EASY backfill, conservative backfill and shortest first: waits as ratios to EASY,
     device time that preemption threw away, processor time per event. Jobs ask for exactly their runtimes. The results
-    for the NASA iPSC log of the Parallel Workloads Archive are in docs/scheduling.md.
+    for the NASA iPSC log of the Parallel Workloads Archive are in docs/evaluation.
 
     \b
     Examples:

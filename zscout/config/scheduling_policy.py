@@ -11,7 +11,7 @@ from zscout.types import SECOND, Ns
 PATIENCE: Final[Ns] = 142 * SECOND
 """Least patience in ns where it follows the runtimes. Measured: docs/evaluation/trace.md."""
 PREEMPT_BUDGET: Final = 0.25
-"""Default. Measured: docs/scheduling.md."""
+"""Default. Measured: docs/evaluation/strategies.md."""
 FAIR_PATIENCE: Final[Ns] = 3_600 * SECOND
 """Default, in ns."""
 OPERATOR_PRIORITY: Final = 10

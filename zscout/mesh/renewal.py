@@ -1,6 +1,6 @@
 """A session that can be reopened, and the contradictions that demand it.
 
-Zenoh's links can come back without all declarations of the other side (docs/protocol.md). When such a contradiction
+Zenoh's links can come back without all declarations of the other side (docs/zenoh.md). When such a contradiction
 lasts, the process opens another session with all its declarations and closes the first; no caller notices."""
 
 from __future__ import annotations

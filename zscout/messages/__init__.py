@@ -1,4 +1,4 @@
-"""The messages of the mesh: JSON objects with their schema in the Zenoh encoding (`docs/protocol.md`).
+"""The messages of the mesh: JSON objects with their schema in the Zenoh encoding (`docs/protocol/messages.md`).
 
 Durations are seconds, never wall times. Unknown fields are ignored, wrong types rejected. Terms, grants and places are
 arrays that compare element by element: `[counter, rcm]`, `[term, seq]`, `[term, arrival]`."""

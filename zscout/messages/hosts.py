@@ -46,9 +46,9 @@ class ComponentUse(Message, frozen=True):
 class LoadReport(Message, frozen=True):
     """A host's load. `number` counts one reporter's reports; memory is in bytes, `cpu` in percent of all cores.
 
-    `speed` is the speed of one core at a fixed piece of work (`docs/protocol.md`): 1.0 does it in 1 ms. Clocks are in
-    MHz, 0 if unknown; `temperature` is in degrees Celsius. `certificate_ends_in`: seconds until the node's certificate
-    expires, negative if it has; `renew`: this is soon enough to warn people."""
+    `speed` is the speed of one core at a fixed piece of work (`docs/protocol/messages.md`): 1.0 does it in 1 ms. Clocks
+    are in MHz, 0 if unknown; `temperature` is in degrees Celsius. `certificate_ends_in`: seconds until the node's
+    certificate expires, negative if it has; `renew`: this is soon enough to warn people."""
 
     host: str
     number: int

@@ -125,7 +125,7 @@ class ComponentChanged:
 
 @dataclass(frozen=True, slots=True)
 class PlacementRefused:
-    """`code` as in docs/protocol.md, `message` one line. `subject`: the component, or the host that can't be
+    """`code` as in docs/protocol/errors.md, `message` one line. `subject`: the component, or the host that can't be
     drained."""
 
     subject: str

@@ -1,7 +1,7 @@
 """Checks every request before it enters the core, whichever way it comes. Pure.
 
 Clients ask, ask for forecasts, hand over, book and take up; at a change of RCM they list their open requests, and RCs
-report their holds. `docs/protocol.md` has the facts for which each sender is trusted."""
+report their holds. `docs/protocol/access.md` has the facts for which each sender is trusted."""
 
 from __future__ import annotations
 

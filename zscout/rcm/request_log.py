@@ -347,7 +347,7 @@ class RequestLog:
         return until is not None and until < now
 
     def starts(self, now: Ns) -> Mapping[ArcId, Ns]:
-        """By queued ARC, forecast once for the whole instant; absent: not within the forecast."""
+        """The starts of queued ARCs, forecast once for the whole instant; absent: not within the forecast."""
         if self._forecast is None or self._forecast[0] != self._core.batches:
             self._starts = forecast(self._core, now, None, self._runtimes).starts
             self._forecast = self._core.batches, now

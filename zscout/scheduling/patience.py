@@ -12,7 +12,7 @@ from zscout.config.scheduling_policy import PATIENCE
 from zscout.types import SECOND, Ns
 
 PATIENCE_IN_RUNTIMES: Final = 28
-"""Measured: docs/scheduling.md."""
+"""See docs/scheduling/waiting.md."""
 MAX_PATIENCE: Final[Ns] = 12 * 3_600 * SECOND
 MAX_COUNTED_RUNTIME: Final[Ns] = 86_400 * SECOND
 """A longer minimum runtime counts as this."""

@@ -16,7 +16,8 @@ while it lasts it precedes these too.
 
 With fair shares an ARC whose group had more than another waiting group counts as queued later (`Arc.late`).
 
-`docs/scheduling.md` states the resulting promise, and the alternatives tried."""
+`docs/scheduling/waiting.md` states the resulting promise, `docs/decisions/0008-worth-of-a-set.md` the alternatives
+tried."""
 
 from __future__ import annotations
 
