@@ -27,7 +27,7 @@ STEP = 0.01
 MOST = 500
 """Largest batch of reports."""
 COMPONENTS = 4
-"""On each host."""
+"""Number on each host."""
 KINDS = ("camera", "servo", "watcher", "planner")
 GIGABYTE = 1_000_000_000
 

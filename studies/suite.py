@@ -34,7 +34,7 @@ IN_PROCESS: Final = (
 """Folders whose tests run guarded code in their own process, where a guard can be removed."""
 ROOMS: Final = ("scheduling", "services", "drivers", "behaviors")
 SUMMED: Final = ("covered_lines", "num_statements", "covered_branches", "num_branches")
-"""Of the summary of a file in a report of coverage.py."""
+"""Counts in the summary of a file, in a report of coverage.py."""
 MOST: Final = 20
 ENDS: Final = 900
 """Seconds after which a run without a guard counts as failed."""

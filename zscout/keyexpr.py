@@ -20,7 +20,7 @@ _CHUNK = rf"(?:\*|(?![^/#]*\$\*\$)(?!\$\*(?:[/#]|\Z))(?:[A-Za-z0-9_.-]|\$\*){{1,
 _PATTERN = re.compile(rf"{_CHUNK}/{_CHUNK}(?:#[1-9][0-9]?)?")
 ROOT = "zscout"
 MAX_DIGITS = 19
-"""Of an incarnation."""
+"""Digits of an incarnation."""
 CACHED_NAMES = 4_096
 """Valid names that are not checked again."""
 

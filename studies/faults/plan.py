@@ -85,15 +85,15 @@ class Fault:
     lasts: float
     kind: FaultKind
     whom: tuple[str, ...]
-    """Processes or hosts. Of a partition: one side. Of a cut: source and target. Of a kill: a process, or several, of
-    which the first to send `message` is killed. Of a double: an RC and a host."""
+    """Processes or hosts. A partition: one side. A cut: source and target. A kill: a process, or several, of
+    which the first to send `message` is killed. A double: an RC and a host."""
     both: bool = True
-    """Of a cut: in both directions. Of a double: it leaves in order. Of a kill: at once, not at the next `message`."""
+    """A cut: in both directions. A double: it leaves in order. A kill: at once, not at the next `message`."""
     message: str = ""
     """A kind of messages, or for a kill an operation."""
     how: Disturbance = field(default_factory=Disturbance)
     jump: int = 0
-    """Of a forged term; or of a clock in seconds; or the seconds that pass on all hosts while everything is down."""
+    """The jump of a forged term, or of a clock in seconds; or the seconds for which all hosts are down."""
 
     @property
     def felt(self) -> float:

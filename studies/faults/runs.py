@@ -70,9 +70,9 @@ class FaultStudy:
 
     runs: int = 0
     seconds: float = 0.0
-    """Of virtual time with faults."""
+    """Seconds of virtual time with faults."""
     took: float = 0.0
-    """Of processors."""
+    """Seconds of processor time."""
     counts: Counter[str] = field(default_factory=Counter)
     faults: Counter[str] = field(default_factory=Counter)
     served_after: list[float] = field(default_factory=list)

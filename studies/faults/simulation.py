@@ -175,7 +175,7 @@ class Result:
     trace: list[str] = field(default_factory=list)
     """The events of holds in order (`zscout.trace`)."""
     digest: str = ""
-    """Of all messages that arrived, in order."""
+    """Digest of all messages that arrived, in order."""
     counts: Counter[str] = field(default_factory=Counter)
     served_after: float = 0.0
     """Seconds from the end of the last fault until all requests were served."""

@@ -56,7 +56,7 @@ REPEAT: Final = 0.2
 BOUND: Final = Fraction(1, 4)
 """Seconds that a packet may wait at the radio, or the time of BOUND_BYTES if that is longer."""
 BOUND_BYTES: Final = 60
-"""As in the node file of `zscout simulate`."""
+"""The same as in the node file of `zscout simulate`."""
 RADIO: Final = "radio/rf0"
 _SOON: Final = 1e-6
 """Seconds below which times are equal."""

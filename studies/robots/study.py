@@ -170,7 +170,7 @@ class FieldFigures:
     noticed: float
     """Share of the walks."""
     noticed_spread: Quantiles
-    """Of the shares of single runs with walks."""
+    """Spread of the shares over single runs with walks."""
     crossings: int
     alerted: float
     """Share of the crossings of a watching robot's picture that were alerted within a second."""
@@ -219,7 +219,7 @@ class StartFigures:
     good: int
     """Of these, starts that ended facing the light."""
     seconds: Quantiles
-    """Until hidden, of the good starts."""
+    """Seconds until hidden, of the good starts."""
     bumped: float
     """Mean seconds of pushing against something."""
 

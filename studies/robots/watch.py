@@ -128,7 +128,7 @@ class Case(NamedTuple):
     noise: float
     seed: int
     seconds: float = 90.0
-    """Of virtual time."""
+    """Virtual time."""
 
 
 def cases(

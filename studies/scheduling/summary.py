@@ -30,7 +30,7 @@ class Decisions:
     p99: float
     longest: float
     first_median: float
-    """Of the first pass of each run. In families that ask at once it is the paper's experiment."""
+    """Median of the first pass of each run. In families that ask at once it is the paper's experiment."""
     first_p99: float
 
 

@@ -21,7 +21,7 @@ from zscout.types import SECOND, Need, Ns, Params
 DEVICES: Final = 32
 LOAD: Final = 0.35
 NAMING: Final = 85
-"""Of 100 programs, the number with a place of their own."""
+"""Percentage of programs with a place of their own."""
 MOST_BY_PATTERN: Final = 4
 PERSONNEL: Final = 2
 """The group of system personnel in the NASA iPSC log."""

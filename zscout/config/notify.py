@@ -16,7 +16,7 @@ from zscout.config.strict import BadInput, Where, key, quoted, read_text, second
 from zscout.types import SECOND, Ns
 
 MAX_URLS: Final = 20
-"""In a list."""
+"""URLs in one list."""
 MAX_USERS: Final = 200
 MAX_URL: Final = 2_000
 """Characters."""

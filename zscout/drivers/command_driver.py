@@ -83,7 +83,7 @@ class CommandDriver(Driver):
         self._lost = ""
         """Why it can't be held."""
         self._failed_starts = 0
-        """In a row."""
+        """Failed starts in a row."""
         self._not_before = 0.0
         """After a failed start it is not offered before this time, by the loop's clock."""
         self._checked = asyncio.Event()

@@ -34,7 +34,7 @@ class Frame:
     `grant` is the hold under which the picture was taken."""
     jpeg: bytes
     arrived: Ns
-    """On this host's clock."""
+    """Time of arrival on this host's clock."""
 
     def __repr__(self) -> str:
         size, taken = f"{self.head.width}x{self.head.height}", f"{self.head.time:.3f} s"

@@ -11,9 +11,9 @@ from zscout.placement.state import MAX_COMPONENTS, PROBE_TIMEOUT, STOP_TIMEOUT, 
 from zscout.types import SECOND, ComponentId, HostName, Ns
 
 MAX_SURPLUS: Final = 100
-"""Of one component."""
+"""Surplus incarnations of one component."""
 PROBES_AT_ONCE: Final = 200
-"""To one host; the next follow after the answers or a timeout."""
+"""Probes to one host at a time; the next follow after the answers or a timeout."""
 
 
 @dataclass(slots=True)

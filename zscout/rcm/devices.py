@@ -61,7 +61,7 @@ class _Device:
     homes: dict[HostName, Home] = field(default_factory=dict)
     sharable: bool = False
     parameters: Parameters | None = None
-    """Of its last report."""
+    """The parameters in its last report."""
 
 
 class ExpectedDevices:

@@ -49,7 +49,7 @@ class _Taken(NamedTuple):
     arc: ArcId
     excludes: bool = False
     held: bool = False
-    """By a hold, which yields to a booking that begins before `start`."""
+    """True for a hold, which yields to a booking that begins before `start`."""
 
 
 def slots(
