@@ -54,8 +54,7 @@ def zone_option(command: F) -> F:
 
 
 async def ask_bookings(client: Client, rc: str | None = None) -> BookingsTold:
-    """Return all bookings that are not over. Warns on stderr if this host's clock differs from fleet time. Raises
-    RequestRefused."""
+    """Warns on stderr if this host's clock differs from fleet time. Raises RequestRefused."""
     answer = await BookingsClient(client).list(rc=rc)
     differs = time.time() - answer.time
     if abs(differs) > MAX_CLOCK_DIFFERENCE_S:
@@ -64,7 +63,7 @@ async def ask_bookings(client: Client, rc: str | None = None) -> BookingsTold:
 
 
 async def look(client: Client) -> BookingsTold | None:
-    """Return all bookings that are not over after one query; None: no answer."""
+    """After one query; None: no answer."""
     reply = await client.mesh.ask_one(
         client.mesh.keys.ask_bookings(client.mesh.me), BookingsAsk(), BookingsTold, timeout=QUERY_TIMEOUT
     )
@@ -100,7 +99,6 @@ def broken(answer: BookingsTold | None) -> dict[str, str]:
 
 
 def reports(answer: BookingsTold | None) -> list[BookingView]:
-    """Return the reports of broken devices that are in force."""
     found = answer.bookings if answer is not None else []
     return [booking for booking in found if booking.broken and not booking.unbooked]
 
@@ -115,7 +113,6 @@ def _end(booking: BookingView, date: BookedDate, answer: BookingsTold) -> str:
 
 
 def maintenance_of(answer: BookingsTold, host: str) -> list[tuple[BookingView, BookedDate]]:
-    """Return the current maintenance of all devices of a host."""
     return [
         (booking, date)
         for booking in answer.bookings
@@ -155,7 +152,7 @@ class NextDate(NamedTuple):
 
 
 def next_dates(answer: BookingsTold | None, needs: Iterable[str], own: str = "") -> list[NextDate]:
-    """Return the next date of each device that meets `needs`, earliest first, without the dates that the request `own`
+    """The next date of each device that meets `needs`, earliest first, without those that the request `own`
     (`<host>/<client>/<id>`) has taken up."""
     meets, found = [matcher(need) for need in needs], dict[str, NextDate]()
     if answer is None:
@@ -178,9 +175,6 @@ def explained(refused: RequestRefused) -> Exception:
     return BadInput(str(refused)) if refused.code in BAD_INPUT_CODES else refused
 
 
-# Which booking is meant
-
-
 def is_own(booking: BookingView, user: User) -> bool:
     return user.owns(booking.owner, booking.who)
 
@@ -191,8 +185,8 @@ def label(booking: BookingView) -> str:
 
 
 def choose(bookings: Sequence[BookingView], name: str, user: User) -> BookingView:
-    """Find the booking that `name` means: the user's own of this name, else the booking with this id, else another
-    user's of this name, else the booking whose id begins with `name`. Raises Failed for none, or several."""
+    """Find the booking that `name` means: the user's own of this name, else by id, else another user's of this name,
+    else by the id's beginning. Raises Failed for none, or several."""
     there = [booking for booking in bookings if not booking.unbooked]
     alike = [booking for booking in there if booking.name == name]
     found = [booking for booking in alike if is_own(booking, user)]
@@ -213,9 +207,6 @@ def free_name(wanted: str, own: Sequence[BookingView]) -> str:
     taken = {booking.name for booking in own}
     numbered = (f"{wanted}-{number}" for number in range(2, len(taken) + 3))
     return wanted if wanted not in taken else next(name for name in numbered if name not in taken)
-
-
-# Words
 
 
 def short(booking: BookingView) -> str:
@@ -271,7 +262,6 @@ def corrected_words(corrected: Correction) -> str:
 
 
 def differs_words(differs: float) -> str:
-    """Words for a clock that is `differs` seconds ahead of the fleet's."""
     return f"{span(abs(differs))} {'ahead of' if differs > 0 else 'behind'} the fleet's"
 
 

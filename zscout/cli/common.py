@@ -73,12 +73,9 @@ class Interrupted(Exception):
         self.exit_code = 128 + number
 
 
-# Running
-
-
 def run(main: Coroutine[Any, Any, T]) -> T:
-    """Run a command's coroutine. SIGINT, SIGTERM and SIGHUP cancel it, so that it cleans up; a second signal cancels
-    the cleaning up. Raises Interrupted after a signal."""
+    """SIGINT, SIGTERM and SIGHUP cancel it, so that it cleans up; a second signal cancels that. Raises Interrupted
+    after a signal."""
     signals: list[int] = []
 
     async def guarded() -> T:
@@ -112,11 +109,8 @@ def runs(main: Callable[P, Coroutine[Any, Any, T]]) -> Callable[P, T]:
     return command
 
 
-# Joining the mesh
-
-
 def _given_file() -> Path | None:
-    """Return the file of `--fleet`; during completion as well, before any command runs."""
+    """Also during completion, before any command runs."""
     context = click.get_current_context(silent=True)
     given = context.find_root().params.get("fleet") if context is not None else None
     return given if isinstance(given, Path) else None
@@ -129,15 +123,15 @@ def fleet_file() -> Path | None:
 
 
 def the_fleet() -> Fleet:
-    """Load the fleet of this call of zscout. Raises BadInput."""
+    """Raises BadInput."""
     given = _given_file()
     return load_fleet(given) if given is not None else fleet_from_env()
 
 
 @asynccontextmanager
 async def connected(role: str, fleet: Fleet | None = None, *, need_rcm: bool = True) -> AsyncIterator[Client]:
-    """Yield a client named `<role>-<random>` on the mesh of `fleet` (default: `the_fleet()`), and close it. Raises
-    MeshError, BadInput, and with `need_rcm` NobodyThere if no RCM is seen in time."""
+    """A client named `<role>-<random>` on the mesh of `fleet` (default: `the_fleet()`). Raises MeshError, BadInput, and
+    with `need_rcm` NobodyThere if no RCM is seen in time."""
     from zscout.behaviors.client.client import Client
 
     async with await Client.connect(f"{role}-{new_instance()}", fleet=fleet or the_fleet()) as client:
@@ -148,8 +142,7 @@ async def connected(role: str, fleet: Fleet | None = None, *, need_rcm: bool = T
 
 
 async def see_rcm(client: Client, seconds: float = FIND_RCM_S) -> None:
-    """Return as soon as an RCM is seen. Raises NobodyThere after `seconds` without an RCM, or after a longer time if a
-    candidate may be about to lead."""
+    """Return once an RCM is seen. Raises NobodyThere after `seconds`, or later if a candidate may be about to lead."""
     from zscout.behaviors.client.client import NoRcm
     from zscout.behaviors.client.remedies import with_remedy
 
@@ -160,7 +153,7 @@ async def see_rcm(client: Client, seconds: float = FIND_RCM_S) -> None:
 
 
 async def state_of(client: Client, arc: str | None = None, *, forecast: bool = False) -> RcmState:
-    """Return the RCM's state, with the explanation of `arc`. Raises NobodyThere if no RCM answers."""
+    """With the explanation of `arc`. Raises NobodyThere if no RCM answers."""
     for _ in range(STATE_TRIES):
         state = await client.state(arc, forecast=forecast)
         if state is not None:
@@ -169,8 +162,7 @@ async def state_of(client: Client, arc: str | None = None, *, forecast: bool = F
 
 
 async def ask_nodes(mesh: Mesh, message: Message, kind: type[T], timeout: float) -> list[Reply[T]]:
-    """Return the answers of all nodes to a question about components. In a secured fleet no node may answer on the
-    shared key, so each node is asked on its own."""
+    """The answers of all nodes. In a secured fleet none may answer on the shared key: each node is asked on its own."""
     keys = mesh.keys
     if not keys.closed:
         return await mesh.ask(keys.component_any(mesh.me), message, kind, timeout=timeout)
@@ -201,7 +193,7 @@ async def beside(work: Coroutine[Any, Any, Any]) -> AsyncIterator[None]:
 
 async def first_of(*works: Coroutine[Any, Any, Any]) -> list[bool]:
     """Run `works` until the first ends, and cancel the others. Return for each whether it had ended; raise its
-    exception if it had one."""
+    exception."""
     tasks = [asyncio.ensure_future(work) for work in works]
     try:
         done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
@@ -214,12 +206,9 @@ async def first_of(*works: Coroutine[Any, Any, Any]) -> list[bool]:
         await asyncio.gather(*tasks, return_exceptions=True)
 
 
-# Options and words
-
-
 def unknown(what: str, name: str, known: Iterable[str], nothing: str, listed: str, more: int = 0) -> Failed:
-    """Return the exception for an unknown `name`. Its line has similar names, else the known names after the word
-    `listed` and the number of `more`, else the words `nothing`."""
+    """The error for an unknown `name`, with similar names, else the known names after `listed` and the number of
+    `more`, else `nothing`."""
     return Failed(f"unknown {what} {quoted(name)}{hint_at(name, known, nothing, listed, more)}")
 
 

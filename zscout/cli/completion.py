@@ -58,8 +58,7 @@ Completer: TypeAlias = Callable[[click.Context, click.Parameter, str], list[str]
 
 
 def _on_mesh(find: Callable[[Mesh, str], Awaitable[Iterable[str]]]) -> Completer:
-    """Return a completer that offers the names that `find(mesh, name of the parameter)` returns, without those already
-    written; none if the mesh can't be joined."""
+    """Offers the names that `find(mesh, name of the parameter)` returns but the line lacks; none without a mesh."""
 
     def complete(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[str]:
         from zscout.cli import common
@@ -113,7 +112,6 @@ async def needs(mesh: Mesh, _parameter: str) -> Iterable[str]:
 
 @_on_mesh
 async def maintained(mesh: Mesh, _parameter: str) -> Iterable[str]:
-    """Devices and hosts."""
     rcs, hosts_ = await asyncio.gather(_rc_names(mesh), _named(mesh, "node"))
     return {*rcs, *hosts_}
 
@@ -125,7 +123,6 @@ async def arcs(mesh: Mesh, _parameter: str) -> Iterable[str]:
 
 @_on_mesh
 async def bookings(mesh: Mesh, _parameter: str) -> Iterable[str]:
-    """Names of bookings that are not over yet."""
     from zscout.messages import BookingsAsk, BookingsTold
 
     reply = await mesh.ask_one(mesh.keys.ask_bookings(mesh.me), BookingsAsk(), BookingsTold, timeout=FIND_S)

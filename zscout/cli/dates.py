@@ -196,9 +196,6 @@ def every_words(days: int) -> str:
     return f"every {unit}" if count == 1 else f"every {count} {unit}s"
 
 
-# Zones
-
-
 def parse_zone(text: str, option: str) -> ZoneInfo:
     """Parse the name of a zone of the IANA database. Raises BadInput."""
     try:
@@ -227,11 +224,8 @@ def host_zone(environ: Mapping[str, str] = os.environ, etc: Path = Path("/etc"))
     raise BadInput("the name of this host's time zone is unknown; write --zone Europe/Berlin, or set TZ")
 
 
-# Words
-
-
 def in_zone(at: float, zone: ZoneInfo | None) -> datetime:
-    """An instant in local time of `zone`; None: of this host."""
+    """None: of this host."""
     return datetime.fromtimestamp(at, UTC).astimezone(zone)
 
 

@@ -29,7 +29,6 @@ def unwell(device: RcState | None) -> str:
 
 
 def remarks(view: RcView) -> Iterator[str]:
-    """Yield the reason that the device is absent, and other hosts that offer it or did so."""
     if words := absence(view):
         yield words
     for host in view.duplicates:

@@ -40,10 +40,9 @@ def instead(text: str) -> dict[str, str]:
 
 
 class LazyGroup(click.Group):
-    """The commands of `headings`, and hidden commands for `old` spellings (name: the new words).
-
-    own: old spellings with a command of their own, by name. instead: the words to write for old spellings, with or
-    without an option, and for names of other programs."""
+    """The commands of `headings`, and hidden commands for `old` spellings (name: the new words). own: old spellings
+    with a command of their own, by name. instead: the words to write for old spellings, with or without an option, and
+    for names of other programs."""
 
     def __init__(
         self,

@@ -62,14 +62,14 @@ PAST: Final = Parsed("time", parse_past)
 
 
 def parse_who(text: str, option: str) -> str:
-    """A user, or a name of a certificate or host. Raises BadInput."""
+    """Raises BadInput."""
     if not 1 <= len(text) <= MAX_NAME:
         raise BadInput(f"{option}: {quoted(text)} is not a name; write 1 to {MAX_NAME} characters")
     return text
 
 
 def parse_rc_pattern(text: str, _option: str) -> str:
-    """An RC, or a pattern. Raises BadName."""
+    """Raises BadName."""
     return check_need(text)
 
 
@@ -109,8 +109,8 @@ def names_of(fleet: Fleet, users: Sequence[str], group: str | None) -> list[str]
 
 
 async def ask_journals(client: Client, asked: HistoryAsk, most: int) -> FleetHistory:
-    """Return the latest holds, at most `most`, from as few journals as hold all known entries. Raises Failed if no
-    journal answers, NobodyThere if no candidate is seen."""
+    """The latest holds, at most `most`, from as few journals as hold all entries. Raises Failed if no journal answers,
+    NobodyThere if no candidate is seen."""
     try:
         return await asking.ask_journals(client.mesh, client.fleet, asked, most, look=FIND_RCM_S)
     except asking.NoCandidate as error:
@@ -118,9 +118,6 @@ async def ask_journals(client: Client, asked: HistoryAsk, most: int) -> FleetHis
         raise Failed(str(error)) from None
     except asking.NoJournal as error:
         raise Failed(str(error)) from None
-
-
-# Words
 
 
 def remarks(answer: FleetHistory) -> Iterable[str]:
@@ -159,8 +156,7 @@ def local(at: float) -> str:
 
 
 def person(hold: PastHold, *, proven: bool) -> str:
-    """Return the holder: the name of its certificate if those are `proven`, else the user that its program named, else
-    its host."""
+    """The holder: its certificate's name if those are `proven`, else the user that its program named, else its host."""
     return hold.client.partition("/")[0] if proven else _owner(hold)
 
 

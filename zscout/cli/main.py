@@ -123,8 +123,7 @@ class OneLineErrors(LazyGroup):
 
 
 def run_command(call: Callable[[], Any], program: str = "zscout") -> Any:
-    """Return the result of `call`; for an error that users can fix print one line that begins with `program`, and
-    return the exit code."""
+    """For an error that users can fix print one line that begins with `program`, and return the exit code."""
     try:
         code = call()
         sys.stdout.flush()

@@ -33,8 +33,8 @@ class User(NamedTuple):
         return cls(client.who.user if client.who is not None else "", client.mesh.me.host, closed)
 
     def owns(self, owner: str, who: Who | None) -> bool:
-        """Return True for the same user on any host; with certificates, or if the user is unknown, for the same
-        `owner`, a host or the name of a certificate."""
+        """Same user on any host; with certificates, or if the user is unknown, same `owner`: a host or certificate's
+        name."""
         user = who.user if who is not None else ""
         return owner == self.host if self.proved or not user else user == self.name
 
@@ -45,8 +45,8 @@ def whose(owner: str, who: Who | None) -> str:
 
 
 async def ask_for_others(client: Client, others: Iterable[str], verb: str, *, yes: bool) -> None:
-    """Ask before doing `verb` to `others`, the words for what other users own. Users without the right are not asked:
-    the fleet refuses them. Raises Failed for a no."""
+    """Ask before doing `verb` to `others`, the words for what other users own; not without the right, as the fleet
+    refuses that. Raises Failed for a no."""
     named = [*others]
     allowed = client.fleet.security is None or "operator" in client.fleet.access.ranks_of(client.mesh.me.host)
     if yes or not named or not allowed:
@@ -58,8 +58,7 @@ async def ask_for_others(client: Client, others: Iterable[str], verb: str, *, ye
 
 
 async def confirm(question: str, unasked: str, no: str, *, code: int | None = None) -> None:
-    """Ask on stderr. Raises Failed: `no` for any answer but y; `unasked`, with this exit code, if there is no
-    terminal."""
+    """Ask on stderr. Raises Failed: `no` for any answer but y; `unasked`, with this exit code, without a terminal."""
     if not (sys.stdin.isatty() and sys.stderr.isatty()):
         raise Failed(unasked, code)
     sys.stderr.write(f"{clean(question)} [y/N] ")

@@ -193,7 +193,7 @@ async def maintain(needs: Sequence[str], yes: bool, broken: str | None, well: bo
 
 
 async def _report(needs: Sequence[str], broken: str | None, *, well: bool, as_json: bool, **dates: Any) -> None:
-    """Report devices broken, or well again. Raises BadInput, Failed, RequestRefused."""
+    """Raises BadInput, Failed, RequestRefused."""
     if broken is not None and well:
         raise BadInput("--broken and --well exclude each other; use only one of them")
     if broken == "":
@@ -249,8 +249,7 @@ class Asked:
         now: float,
         late: float = 0.0,
     ) -> Asked:
-        """Check the options. `late`: seconds after its start within which a date can still be booked. Raises
-        BadInput."""
+        """`late`: seconds after its start within which a date can still be booked. Raises BadInput."""
         start, last = at.found(now, zone), None
         begins = start.at.timestamp()
         if begins + late <= now:
@@ -360,7 +359,7 @@ async def _make(
 
 
 async def _displaced(client: Client, needs: Needs, asked: Asked, priority: int, answer: BookingsTold) -> Displaced:
-    """Return the holds and bookings that maintenance displaces. Raises BadInput for an unknown host."""
+    """Raises BadInput for an unknown host."""
     state = await common.state_of(client)
     hosts = {view.host for view in state.rcs if view.host}
     for host in filter(None, map(host_in, needs)):
@@ -379,7 +378,6 @@ def _named_after(needs: Needs) -> str:
 
 
 async def _not_free(client: Client, refused: RequestRefused, needs: Needs, asked: Asked, priority: int) -> str:
-    """Return the error line with free times."""
     start = asked.start.at
     try:
         how: dict[str, Any] = {"start": start, "priority": priority, "limit": MAX_SUGGESTIONS}

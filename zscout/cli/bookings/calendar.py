@@ -45,9 +45,6 @@ FIND_RCS_S: Final = 1.0
 _NEXT_NEED: Final = re.compile(r",(?=[^,=]*/)")
 
 
-# Export
-
-
 @click.command()
 @click.option(
     "--rc",
@@ -93,7 +90,7 @@ async def export(rc: str | None, owner: str | None, out: str | None, folder: Pat
 
 
 def _write_all(folder: Path, fleet: str, bookings: list[BookingView], rcs: Iterable[str]) -> tuple[int, int]:
-    """Write all calendars. Return the number of files that changed, and of all files. Raises Failed."""
+    """Return how many files changed, and how many there are. Raises Failed."""
     bound = {rc for booking in bookings for date in booking.dates for rc in date.bound.values()}
     maintained = {rc for booking in bookings for rc in booking.maintained}
     named = {need for booking in bookings for need in booking.needs if not is_pattern(need) and host_in(need) is None}
@@ -107,7 +104,7 @@ def _write_all(folder: Path, fleet: str, bookings: list[BookingView], rcs: Itera
 
 
 def _write(path: Path, text: bytes) -> bool:
-    """Write the file if its text changed; return True if it did. Raises Failed."""
+    """Return True if the text changed. Raises Failed."""
     try:
         if path.exists() and not path.is_file():  # a device, a pipe
             path.write_bytes(text)
@@ -121,11 +118,8 @@ def _write(path: Path, text: bytes) -> bool:
     return True
 
 
-# Import
-
-
 def parse_needs(text: str, option: str) -> Pairs:
-    """Parse `robot/arm1,framegrabber/*,radio/rf0:command_rate=5`; a repeated pattern asks for one more device. Raises
+    """Parse `robot/arm1,framegrabber/*,radio/rf0:command_rate=5`; a repeated pattern asks for one more. Raises
     BadInput."""
     if not text:
         raise BadInput(f"{option}: names no device; write one, as in robot/arm1")
@@ -250,7 +244,7 @@ class _Import:
             row.result, row.why, row.failed = "not free", "zscout slots lists free times", True
 
     async def _book(self, ids: tuple[str, ...], book: Book, row: Row) -> BookingView | None:
-        """Return the booking; None if it is not booked, with the reason in the row. Raises NobodyThere."""
+        """None: not booked, with the reason in the row. Raises NobodyThere."""
         for booking in ids if self.again else ids[:1]:
             made = await self._ask(replace(book, id=booking), row)
             if made is None or not made.unbooked:
@@ -267,7 +261,7 @@ class _Import:
             await self._ask(Unbook(view.id, who=self.client.who), row)
 
     async def _ask(self, operation: Book | Unbook, row: Row) -> BookingView | None:
-        """Return the booking; None if refused, with the reason in the row. Raises NobodyThere."""
+        """None: refused, with the reason in the row. Raises NobodyThere."""
         try:
             return await BookingsClient(self.client).ask(operation, BookingView)
         except RcmSilent as silent:

@@ -80,8 +80,8 @@ class CalendarEvent:
 
 
 def read_calendar(data: bytes, source: str) -> list[CalendarEvent]:
-    """Return the events of a file, in its order. An event that can't be read has a `problem`. Raises BadInput for a
-    file that is no calendar, or too large."""
+    """In the file's order; an event that can't be read has a `problem`. Raises BadInput for no calendar, or a large
+    file."""
     where = Where(source)
     if len(data) > MAX_BYTES:
         raise where.bad(f"has more than {MAX_BYTES:,} bytes", "export less, such as only the coming year")

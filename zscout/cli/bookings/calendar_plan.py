@@ -66,8 +66,8 @@ class ImportOptions:
 
 @dataclass(frozen=True, slots=True)
 class Wanted:
-    """A booking of the calendar. It uses the first of its `ids` that was not cancelled: a cancelled id can't be booked
-    again. `book`: None if all its dates are dropped. `dropped`: coming dates without the event."""
+    """Uses the first of its `ids` that was not cancelled: a cancelled id can't be booked again. `book`: None if all its
+    dates are dropped. `dropped`: coming dates without the event."""
 
     ids: tuple[str, ...]
     title: str
@@ -94,7 +94,7 @@ class ImportPlan:
 
 
 def plan_import(events: Iterable[CalendarEvent], options: ImportOptions, now: float) -> ImportPlan:
-    """Plan the bookings at `now`, in seconds since 1970. Raises BadInput for too many."""
+    """`now`: seconds since 1970. Raises BadInput for too many."""
     events = list(events)
     moved: dict[str, set[Instant]] = defaultdict(set)
     for event in events:
@@ -154,8 +154,6 @@ def _is_need(text: str) -> bool:
 
 
 class _EventPlanner:
-    """Plans the bookings of one event."""
-
     def __init__(
         self, plan: ImportPlan, event: CalendarEvent, title: str, needs: Needs, options: ImportOptions, now: float
     ) -> None:
@@ -185,8 +183,6 @@ class _EventPlanner:
             single |= {self._at(at) for at in self._dates()}
         for at in sorted(single - given_up):
             self._add_once(at)
-
-    # Dates
 
     def _at(self, local: datetime) -> Instant:
         return Moment(local, self._zone).instant(self._zone)
@@ -239,8 +235,6 @@ class _EventPlanner:
         if not 0 < seconds <= MAX_AHEAD:
             raise ValueError("it has no length" if seconds <= 0 else "it is longer than a year")
         return seconds
-
-    # Bookings
 
     def _add_once(self, at: Instant) -> None:
         runtime = self._runtime(self._local(at))

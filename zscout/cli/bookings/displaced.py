@@ -74,8 +74,8 @@ class Displaced:
         }
 
     async def agree(self, name: str, *, yes: bool) -> None:
-        """Print the lines on stderr, and ask if anything is displaced. Raises Failed: for a no, or with exit code 2 if
-        there is no terminal."""
+        """Print the lines on stderr, and ask if anything is displaced. Raises Failed for a no, or without a terminal
+        (exit 2)."""
         for line in self.lines():
             print_line(clean(f"{name} {line}"), sys.stderr)
         if self and not yes:
@@ -88,5 +88,4 @@ def _at(seconds: float) -> str:
 
 
 def covers(need: str, rc: str, host: str) -> bool:
-    """Return True if maintenance of `need` has this device of `host`."""
     return need == rc or (matcher(need)(rc) if is_pattern(need) else host_in(need) == host)

@@ -140,7 +140,6 @@ def _day(at: WrittenDate, now: float, zone: ZoneInfo | None) -> datetime.date:
 
 
 def _on_day(booking: BookingView, day: datetime.date, zone: ZoneInfo | None) -> BookingView:
-    """Return the booking with only its dates that overlap the day."""
     return replace(
         booking,
         dates=[
@@ -152,7 +151,6 @@ def _on_day(booking: BookingView, day: datetime.date, zone: ZoneInfo | None) -> 
 
 
 def _may_have(booking: BookingView, matches: Callable[[str], bool], pattern: str) -> bool:
-    """Return True if the booking has an RC that matches, or asks by that pattern."""
     bound = {rc for date in booking.dates for rc in date.bound.values()}
     return any(matches(need) or need.partition("#")[0] == pattern for need in (*booking.needs, *bound))
 
@@ -244,7 +242,7 @@ async def unbook(booking: str, at: WrittenDate | None, zone: ZoneInfo | None, ye
 
 
 def _date_of(booking: BookingView, at: WrittenDate, zone: ZoneInfo, now: float) -> int:
-    """Return the start of the booking's date that `at` means. Raises Failed if there is none, BadInput for several."""
+    """Raises Failed if there is none, BadInput for several."""
     listed = [date.start for date in booking.dates]
     coming = listed + [start for start in dates(_record(booking), now + WINDOW, now + MAX_AHEAD) if start not in listed]
     day = at.whole_day(now, zone)

@@ -30,8 +30,8 @@ DAYS_OF_WEEK: Final = ("MO", "TU", "WE", "TH", "FR", "SA", "SU")
 
 @dataclass(frozen=True, slots=True)
 class RepeatRule:
-    """A parsed RRULE. `by_day`: (number in the month or 0 for all, weekday with 0 for Monday). Empty parts follow the
-    event's first date."""
+    """`by_day`: (number in the month or 0 for all, weekday from Monday, 0). Empty parts follow the event's first
+    date."""
 
     freq: str
     interval: int = 1
@@ -89,7 +89,7 @@ def parse_rule(parts: Mapping[str, Sequence[Any]]) -> RepeatRule:
 
 
 def _single_value(parts: Mapping[str, Sequence[Any]], name: str, default: Any) -> Any:
-    """Return the only value of a part. Raises ValueError for several."""
+    """Raises ValueError for several."""
     values = parts.get(name, [default])
     if len(values) != 1:
         raise ValueError(f"its rule has more than one {name}")
@@ -97,8 +97,8 @@ def _single_value(parts: Mapping[str, Sequence[Any]], name: str, default: Any) -
 
 
 def occurrences(rule: RepeatRule, start: datetime, since: datetime, before: datetime) -> Iterator[datetime]:
-    """Yield the local times in [`since`, `before`) of an event whose first date is `start`, all without a zone. UNTIL
-    is not applied: the caller knows the zone."""
+    """Yield the local times in [`since`, `before`) of an event from `start` on, all without a zone. UNTIL is not
+    applied: the caller knows the zone."""
     number = 0
     for period in count(0 if rule.count is not None else _periods(rule, start, since)):
         begin, days = _period(rule, start.date(), period)

@@ -74,8 +74,6 @@ async def kinds(as_json: bool) -> None:
 
 
 class Listing:
-    """The components of a fleet, from the placer, the nodes and the load reports."""
-
     def __init__(self, client: Client, name: str | None) -> None:
         self.client, self.name = client, name
         self.placer = placer_of(client, None if name is None else {name})
@@ -84,8 +82,7 @@ class Listing:
         """Start of each running incarnation, on this host's clock."""
 
     async def find(self) -> None:
-        """Wait for the components and for the load reports of their hosts. Raises NobodyThere; Failed if `name` is
-        unknown."""
+        """Wait for the components and their hosts' load reports. Raises NobodyThere; Failed if `name` is unknown."""
         await self.placer.refresh()
         if self.name is not None and self.name not in self.placer.placements:
             raise await unknown_here(self.placer, self.name)

@@ -76,8 +76,7 @@ class Reader:
         return self._placer.placements.get(self._name)
 
     async def first(self, *, follow: bool) -> Output:
-        """Return the output so far; with `follow`, wait until the component has been started. Raises Failed,
-        NobodyThere."""
+        """The output so far; with `follow`, wait until the component was started. Raises Failed, NobodyThere."""
         try:
             await common.see_rcm(self._client)
             await self._placer.refresh()
@@ -146,8 +145,8 @@ class Reader:
         return await self._read() if found else None
 
     async def _successor(self, *, silent: bool) -> bool:
-        """Wait for a newer incarnation, or, if its host was `silent`, for the same to be listed again. Return False
-        if the component has ended for good. Raises NobodyThere."""
+        """Wait for a newer incarnation or, if its host was `silent`, for the same to be listed again. Return False if
+        it has ended for good. Raises NobodyThere."""
         missed = 0
         await self._placer.refresh()
         while True:
@@ -165,7 +164,6 @@ class Reader:
             await self._placer.wait_changed()
 
     async def _nothing(self) -> common.Failed:
-        """Return the exception for a component without output."""
         if self._only and self._host is not None:
             for line in await absent(self._client.mesh, [self._host]):
                 return common.Failed(f"--host: {line}")
@@ -188,7 +186,7 @@ class Reader:
 
 
 def last(text: str, lines: int | None) -> str:
-    """Return the last `lines` lines; None: all."""
+    """None: all."""
     if lines is None:
         return text
     return "".join(text.splitlines(keepends=True)[-lines:]) if lines else ""

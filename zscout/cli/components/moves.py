@@ -51,7 +51,7 @@ async def migrate(name: str, to: str | None, yes: bool, as_json: bool) -> None:
 
 
 async def _move(placer: PlacerClient, shown: placing.Progress, before: Placement, to: str | None) -> Placement:
-    """Move a component, and show the progress. Raises Failed if it was not moved."""
+    """Raises Failed if it was not moved."""
     name = before.component
 
     def begun(record: Placement) -> bool:

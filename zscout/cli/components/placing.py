@@ -39,8 +39,8 @@ def placer_of(client: Client, only: Collection[str] | None = None) -> PlacerClie
 async def connected(
     command: str, only: Collection[str] | None = None, *, as_json: bool
 ) -> AsyncIterator[tuple[Client, Progress, PlacerClient]]:
-    """Yield client, progress and placer of a command, once the placer has listed all components, or those in `only`.
-    Raises NobodyThere, MeshError, RequestRefused."""
+    """Client, progress and placer of a command, once the placer has listed all components, or those in `only`. Raises
+    NobodyThere, MeshError, RequestRefused."""
     async with common.connected(command) as client:
         with Progress(quiet=as_json) as shown, placer_of(client, only) as placer:
             await placer.refresh()
@@ -73,15 +73,14 @@ class Progress(terminal.LiveLine):
         self._last = text
 
     def finish(self, text: str) -> None:
-        """Print a result; it stays on the screen."""
+        """It stays on the screen."""
         self.hide()
         if not self._quiet:
             self.print(text)
 
     @asynccontextmanager
     async def within(self, seconds: float | None, late: Callable[[], str], interrupted: str) -> AsyncIterator[None]:
-        """Bound the time of the block. Raises Failed with `late()` after `seconds`; on Ctrl-C prints `interrupted` on
-        stderr."""
+        """Raises Failed with `late()` after `seconds`; on Ctrl-C prints `interrupted` on stderr."""
         try:
             async with asyncio.timeout(seconds):
                 yield
@@ -180,7 +179,7 @@ def placement_object(placement: Placement) -> dict[str, Any]:
 
 
 def component_named(text: str, _option: str = "") -> str:
-    """Check the name of a component. Raises BadInput."""
+    """Raises BadInput."""
     try:
         return check_name(text, "component")
     except ValueError as error:

@@ -65,8 +65,7 @@ CORES: Final = common.Parsed("cores", parse_cores)
 
 
 def gather_params(given: str | None, settings: Sequence[str]) -> dict[str, Any]:
-    """Return the parameters of a component: a JSON object, overridden by `KEY=VALUE` settings. A VALUE that is not
-    JSON is a text. Raises BadInput."""
+    """A JSON object, overridden by `KEY=VALUE` settings. A VALUE that is not JSON is a text. Raises BadInput."""
     params: dict[str, Any] = {}
     if given is not None:
         try:
@@ -191,7 +190,7 @@ def gather_spec(
 
 
 async def _place(placer: PlacerClient, name: str, spec: ComponentSpec, before: Placement | None) -> Placement:
-    """Place a component; do not wait until it runs. Raises Failed."""
+    """Does not wait until it runs. Raises Failed."""
     known = before.incarnation if before is not None else 0
 
     def done(record: Placement) -> bool:

@@ -119,7 +119,7 @@ async def _look(file: Path | None) -> Evidence:
 
 
 def _look_at_certificates(seen: Evidence, fleet: Fleet) -> str:
-    """Read the certificates; return the trusted CAs in PEM, or "" without any."""
+    """Return the trusted CAs in PEM, or ""."""
     if fleet.security is None:
         return ""
     cas = ""

@@ -173,7 +173,6 @@ def _multicast(seen: Evidence) -> Iterator[Finding]:
 
 
 def _called(seen: Evidence) -> Iterator[Finding]:
-    """Yield problems of the addresses under `connect`."""
     fleet = _the_fleet(seen)
     named = [answer for answer in seen.answers if answer.address in fleet.mesh.connect]
     # If this host's node runs, an own address without an answer does not matter: the node may listen at another.
@@ -196,7 +195,6 @@ def _called(seen: Evidence) -> Iterator[Finding]:
 
 
 def _host_in(address: str) -> str:
-    """Return the host name in an address, without its domain."""
     return address.partition("/")[2].rpartition(":")[0].partition(".")[0]
 
 
@@ -234,7 +232,6 @@ def _security(seen: Evidence) -> Iterator[Finding]:
 
 
 def _member(address: str, certificate: Validity, objection: str, seen: Evidence) -> Iterator[Finding]:
-    """Check a host whose certificate one of our CAs issued."""
     name = f"{certificate.name} ({address})"
     if seen.at >= certificate.ends:
         says = f"the certificate of {name} expired on {shown(certificate.ends)}"

@@ -56,8 +56,7 @@ class Host:
 
 
 class FleetView:
-    """A client's view of its fleet: tokens and loads, followed while the context is open, and the RCM's state on
-    request."""
+    """Tokens and loads, followed while the context is open, and the RCM's state on request."""
 
     def __init__(self, client: Client) -> None:
         self.client, self.mesh = client, client.mesh
@@ -103,7 +102,7 @@ class FleetView:
         }
 
     def all_hosts(self) -> dict[str, Host]:
-        """Return all hosts, including the fleet's candidates that are missing."""
+        """With the fleet's missing candidates."""
         missing = {name: Host() for name in self.client.fleet.candidates if name not in self.hosts}
         return dict(sorted((missing | self.hosts).items()))
 
@@ -124,7 +123,6 @@ class FleetView:
         return {name: load.certificate_ends_in or 0.0 for name, load in sorted(loads.items())} | found
 
     def rights(self) -> dict[str, list[str]]:
-        """Return the hosts by the digest of the rights that they enforce."""
         pairs = sorted(
             (host.load.rights, name) for name, host in self.hosts.items() if host.load and host.has(Role.LOAD)
         )
@@ -149,8 +147,7 @@ class FleetView:
             await common.until(lambda: len(self.hosts) > known, self.changed, QUIET_S)  # noqa: B023 - awaited
 
     async def settled(self, *, loads: bool = True) -> RcmState:
-        """Return the RCM's state once its RCs are seen, and with `loads` the hosts and their loads. Raises
-        NobodyThere."""
+        """The RCM's state once its RCs are seen, and with `loads` the hosts and their loads. Raises NobodyThere."""
         await common.see_rcm(self.client)
         if not loads:
             state = await common.state_of(self.client)
@@ -213,7 +210,6 @@ class FleetView:
 
 
 async def see_hosts(client: Client) -> None:
-    """Wait until all hosts have been seen."""
     with FleetView(client) as seen:
         await seen.quiet()
 

@@ -20,7 +20,7 @@ COLUMNS = (
 
 
 def parse_arc(text: str, option: str) -> str:
-    """Check the name or id of an ARC. Raises BadInput."""
+    """Raises BadInput."""
     if not 1 <= len(text) <= MAX_ARC_NAME:
         raise BadInput(f"{option}: {quoted(text)} can't be the name of a request; write 1 to {MAX_ARC_NAME} characters")
     return text

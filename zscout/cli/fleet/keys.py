@@ -50,9 +50,9 @@ async def show_keys(*, as_json: bool) -> None:
 
 
 def served(own: Keys, token: Token, sharable: set[str] | None) -> list[dict[str, Any]]:
-    """Return the keys of the participant with this token. `how`: query (it answers), put (it publishes) or hear (it
-    subscribes). `sharable`: the RCs that vote; None: unknown, any may. On a secured fleet keys of queries have the
-    asker's name."""
+    """The keys of the participant with this token. `how`: query (it answers), put (it publishes) or hear (it
+    subscribes). `sharable`: the RCs that vote; None: unknown. On a secured fleet keys of queries have the asker's
+    name."""
     match token.role:
         case Role.RCM:
             found = [

@@ -34,8 +34,7 @@ def local_address(recorded: Recorded, bind: str) -> str | None:
 
 
 def _owner(recorded: Recorded) -> int | None:
-    """The user id that owns the recording, if it is a regular file that a recorder of this host writes now. Raises
-    OSError, ValueError."""
+    """The owner's user id of a regular file that a recorder of this host writes now. Raises OSError, ValueError."""
     path = Path(recorded.file)
     if path.suffix != ".rrd" or not path.is_absolute():
         return None

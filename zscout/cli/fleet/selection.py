@@ -16,8 +16,8 @@ from zscout.messages import HoldView, RcmState, WaitView
 
 @dataclass(slots=True)
 class Selection:
-    """A part of `state` and `hosts`, or all of both without `names`; `homes` has the host of each device. A name may be
-    a pattern."""
+    """A part of `state` and `hosts`, or all without `names`, which may be patterns; `homes`: the host of each
+    device."""
 
     names: Sequence[str]
     state: RcmState | None

@@ -85,8 +85,7 @@ async def status(names: Sequence[str], watch: bool, every: bool, as_json: bool) 
 
 @dataclass(slots=True)
 class StatusView:
-    """The state of the fleet as `zscout status` shows it. `state`: None if no node leads. `every`: show figures of all
-    devices. `names`: if not empty, show only these."""
+    """`state`: None if no node leads. `every`: show figures of all devices. `names`: if not empty, show only these."""
 
     fleet_view: FleetView
     state: RcmState | None
@@ -96,7 +95,6 @@ class StatusView:
     booked: BookingsTold | None = None
 
     def selection(self) -> Selection:
-        """Return the part of the fleet to show."""
         return Selection(self.names, self.state, self._homes(), self.fleet_view.all_hosts())
 
     async def refresh(self) -> None:
@@ -162,7 +160,7 @@ class StatusView:
         return versions(self.fleet_view.hosts, self.devices.known(), self.state)
 
     def _homes(self) -> dict[str, str]:
-        """Return the host of each device: the leader's choice, else a host that offers the device."""
+        """By device: the leader's choice, else a host that offers it."""
         offered = {token.name: token.host for token in self.fleet_view.tokens(Role.RC)}
         views = self.state.rcs if self.state is not None else []
         return offered | {view.rc: view.host for view in views if view.host}
@@ -240,13 +238,11 @@ class StatusView:
         return Table("Health", ("DEVICE", "HEALTH", "FIGURES"), rows, styles)
 
     def as_object(self) -> dict[str, Any]:
-        """Return the object of `--json`, durations in seconds and memory in bytes.
-
-        rcm: null if no node leads. advisory: rights are listed and not enforced. rights: hosts by the digest of the
-        rights that they enforce. own_rights: the digest of this fleet file. faults: reasons that hosts use older
-        settings than their files have. unrecorded: reasons that recorders of hosts write nothing. ending: certificates
-        that expire soon. clocks: differences of hosts' clocks from fleet time. booked_soon: dates of bookings within
-        24 h."""
+        """Durations in seconds, memory in bytes. rcm: null if no node leads. advisory: rights are listed and not
+        enforced. rights: hosts by the digest of the rights that they enforce. own_rights: the digest of this fleet
+        file. faults: reasons that hosts use older settings than their files have. unrecorded: reasons that recorders of
+        hosts write nothing. ending: certificates that expire soon. clocks: differences of hosts' clocks from fleet
+        time. booked_soon: dates of bookings within 24 h."""
         chosen, versions = self.selection(), self._versions()
         state, homes, now = chosen.state, self._homes(), self.fleet_view.mesh.now()
         holds, views, queue = (state.holds, state.rcs, state.queue) if state is not None else ([], [], [])
@@ -334,7 +330,6 @@ def versions(hosts: Mapping[str, Host], devices: Mapping[str, RcState], state: R
 
 
 def by_version(versions: Mapping[str, str]) -> dict[str, list[str]]:
-    """Return the hosts by version."""
     return {
         version: sorted(host for host in versions if versions[host] == version) for version in sorted(versions.values())
     }
@@ -389,7 +384,7 @@ def running(
 
 
 def waiting(state: RcmState, ranks: Mapping[str, int], *, plain: bool) -> Table:
-    """Return the table of the queue in rank order, with each request's place in the whole queue."""
+    """In rank order, with the place in the whole queue."""
     rows = []
     for wait in state.queue:
         number = ranks[f"{wait.client}/{wait.id}"]

@@ -62,7 +62,7 @@ _COLOURS: Final = re.compile(r"\x1b\[[0-9;]*m")
 
 
 def parse_recorded_past(text: str, option: str) -> Ns:
-    """Parse a duration. Raises BadInput."""
+    """Raises BadInput."""
     found = parse_duration(text)
     if found is None or found > MAX_PAST:
         raise BadInput(f"{option}: {quoted(text)} is not a duration up to {MAX_PAST // 86_400}d; write {DURATIONS}")
@@ -144,9 +144,9 @@ async def view(
 async def open_viewer(
     recording: Recording, *, web: bool, bind: str = "127.0.0.1", port: int | None = None, stream: int = 0
 ) -> AsyncIterator[tuple[Child, str | None]]:
-    """Open a viewer with the recording, live if it has a `url`. Yield the viewer, and with `web` the address of the
-    page as soon as it is served. port: of the page; None: any. stream: port on which a file is served to the page; 0:
-    any. Raises BadInput, Failed."""
+    """Open a viewer with the recording, live if it has a `url`. Yield it, and with `web` the page's address once it is
+    served. port: of the page; None: any. stream: port on which a file is served to the page; 0: any. Raises BadInput,
+    Failed."""
     shown = recording.url or recording.file
     if not web:
         async with viewer(*WINDOW_ARGUMENTS, *(["--connect"] if recording.url is not None else []), shown) as window:
@@ -214,8 +214,8 @@ async def _source(
 
 
 async def _recorded_here(fleet: Fleet, bind: str) -> tuple[Recording | None, str]:
-    """Find the recording of a node of this host that pages on `bind` can show; None if there is none. The second
-    result is a line to print if there is no RCM: the view is empty, and may fill later."""
+    """The recording of a node of this host that pages on `bind` can show, if any, and a line to print if there is no
+    RCM: the view is empty, and may fill later."""
     from zscout.messages import Recorded, RecordedAsk
 
     async with common.connected("view", fleet, need_rcm=False) as client:
@@ -245,8 +245,8 @@ def _is_node(fleet: Fleet, host: str) -> bool:
 
 
 async def _reached(recorded: Recorded, bind: str) -> Recording | None:
-    """Return the recording if a recorder of this host writes and serves it. `bind`: address of the page; browsers that
-    open it must reach the live stream as well."""
+    """The recording if a recorder of this host writes and serves it. `bind`: of the page; its browsers must reach the
+    stream as well."""
     address = await asyncio.to_thread(local_address, recorded, bind)
     if address is None:
         return None
@@ -291,9 +291,6 @@ def _bracketed(address: str) -> str:
 def _host(bind: str) -> str:
     """Return the host in a URL for `bind`: this host's name if `bind` means all addresses."""
     return socket.gethostname() if ipaddress.ip_address(bind).is_unspecified else _bracketed(bind)
-
-
-# Viewer and recorder
 
 
 class Child:
@@ -381,8 +378,8 @@ class Child:
 async def child(
     what: str, command: Sequence[str], env: Mapping[str, str], *, job: bytes | None = None
 ) -> AsyncIterator[Child]:
-    """Start a child that ends with this context, and with this process however that ends. The child has a session of
-    its own: Ctrl-C reaches only this process, which then ends the child in order."""
+    """A child that ends with this context, and with this process however that ends. It has a session of its own: Ctrl-C
+    reaches only this process, which then ends the child in order."""
     pipe = asyncio.subprocess.PIPE
     process = await asyncio.create_subprocess_exec(
         *LAUNCH,

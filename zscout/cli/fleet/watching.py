@@ -73,8 +73,7 @@ class Overview:
                 table.print()
 
     def lines(self, width: int) -> list[Line]:
-        """Return the lines for a terminal of this width, the headline first. Blank lines divide the tables if the whole
-        then fits a terminal of the usual height."""
+        """The headline first. Blank lines divide the tables if the whole then fits a terminal of the usual height."""
         style = "bold red" if self.alarm else "bold"
         lines = [(line, style) for line in terminal.wrapped(terminal.clean(self.headline), width)]
         tables = [table for table in self.tables if table.rows]
@@ -88,8 +87,8 @@ class Overview:
 
 
 class Scrolled:
-    """The part of an overview that fits a terminal: its headline, lines of its tables from the line that keys have
-    chosen, and a hint."""
+    """The part of an overview that fits a terminal: headline, lines of tables from the one that keys chose, and a
+    hint."""
 
     def __init__(self) -> None:
         self._first = self._last = 0
@@ -122,8 +121,6 @@ class Scrolled:
 
 
 class Displayed(Protocol):
-    """The newest state of something."""
-
     def overview(self) -> Overview:
         """For people."""
 
@@ -134,8 +131,8 @@ class Displayed(Protocol):
 async def show(
     shown: Displayed, news: asyncio.Event, refresh: Callable[[], Awaitable[None]], *, watch: bool, as_json: bool
 ) -> None:
-    """Show `shown` once. With `watch`, refresh and show it after news and each second, until the user presses q: in
-    place at a terminal, in a pipe as another block if fields changed that are not volatile."""
+    """Show `shown` once. With `watch`, also after news and each second, until the user presses q: in place at a
+    terminal, in a pipe as another block if not only volatile fields changed."""
     stop = asyncio.Event()
     printed: Any = None
     scrolled = Scrolled()

@@ -131,8 +131,8 @@ async def uncordon(host: str, as_json: bool) -> None:
 
 
 async def _close(client: Client, placer: PlacerClient, host: str, *, urgent: bool, comment: str) -> str:
-    """Book maintenance of the host until it is cancelled. If the leader can't, cordon the host for components alone
-    and return the reason; otherwise return "". Raises Failed, RequestRefused."""
+    """Book maintenance of the host until it is cancelled; if the leader can't, cordon the host for components alone,
+    and return why ("" otherwise). Raises Failed, RequestRefused."""
     known, me, bookings_client = await ask_bookings(client), User.of(client), BookingsClient(client)
     drains = [booking for booking, _ in maintenance_of(known, host) if booking.lasting]
     is_drained = any(booking.urgent or not urgent for booking in drains)
@@ -172,8 +172,6 @@ async def _check_host(client: Client, placer: PlacerClient, host: str) -> None:
 
 
 class _Leftovers:
-    """The components and holds left on a host."""
-
     def __init__(self, client: Client, placer: PlacerClient, host: str) -> None:
         self._client, self._placer, self._host = client, placer, host
         self.holds: list[HoldView] = []

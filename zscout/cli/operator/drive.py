@@ -239,8 +239,6 @@ class _Console(terminal.LiveLine):
 
 
 class Hands:
-    """Actions of the operator's keys and game pad."""
-
     def __init__(self, teleop: Teleop, end: asyncio.Event) -> None:
         self.teleop, self.pilot, self._end = teleop, teleop.pilot, end
 
@@ -279,8 +277,8 @@ class Hands:
 
 @contextmanager
 def game_pad(device: Path, moved: Callable[[float, float], None], button: Callable[[int], None]) -> Iterator[None]:
-    """Call `moved(forward, right)`, -1 to 1 each, when the left stick moves, and `button` with the number of a pressed
-    button. An unplugged pad moves to 0, 0. Raises BadInput if the device can't be opened."""
+    """Call `moved(forward, right)`, -1 to 1 each, when the left stick moves (0, 0 if unplugged), and `button` with the
+    number of a pressed button. Raises BadInput if the device can't be opened."""
     try:
         descriptor = os.open(device, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     except OSError as error:

@@ -34,8 +34,7 @@ MAX_PICTURE_BYTES: Final = 2 << 30
 
 
 class PictureRecording(Drawing):
-    """A recording of pictures and events, in a file, or served on loopback, or both. Times are seconds since a zero of
-    the caller's choice."""
+    """In a file, or served on loopback, or both. Times are seconds since a zero of the caller's choice."""
 
     def __init__(
         self,

@@ -60,8 +60,8 @@ async def take(needs: Any, yes: bool, no_keep: bool, name: str | None, reason: s
 
 @dataclass(slots=True)
 class TakeoverCost:
-    """The cost of taking devices for others: holds that end for certain, that may end, and that do not yield. `either`:
-    by pattern, holds of which one must end first; `missing`: by pattern without its number, how many of them."""
+    """Holds that end for certain, that may end, and that do not yield. `either`: by pattern, holds of which one must
+    end first; `missing`: by pattern without its number, how many of them."""
 
     priority: int
     """Priority of the request."""

@@ -111,8 +111,7 @@ class VideoFile:
 
 
 class LiveSource:
-    """A URL or device, as framegrabbers read it: the newest picture is used, and a source that fails is opened again.
-    Times are seconds since the first picture."""
+    """As for framegrabbers: the newest picture, reopened after failures. Times are seconds since the first picture."""
 
     duration: float | None = None
 

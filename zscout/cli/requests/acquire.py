@@ -58,7 +58,6 @@ for_option: Final = click.option(
 
 
 def _tokens(_ctx: click.Context, _param: click.Parameter, incomplete: str) -> list[str]:
-    """Complete a token."""
     return [token for token in token_files.tokens() if token.startswith(incomplete)]
 
 
@@ -123,8 +122,8 @@ async def acquire(
 
 
 def _job_process() -> int | None:
-    """Return the shell of a GitLab job, which leads the process group of the job. Other CI services run each step in a
-    shell of its own, and find leftover processes by their environment."""
+    """A GitLab job's shell, which leads the job's process group. Other CI services run each step in a shell of its own,
+    and find leftover processes by their environment."""
     group = os.getpgrp()
     return group if os.environ.get("GITLAB_CI") and group not in (0, os.getpid()) else None
 
@@ -166,9 +165,6 @@ async def _start(follow: int | None, json_file: str | None, *, as_json: bool) ->
     if code < 0:
         raise Failed(f"the holder process was ended by signal {-code}; nothing is held")
     return code
-
-
-# With a token
 
 
 class UsedToken:
@@ -340,8 +336,7 @@ async def renew(token: str, span_: Decimal, as_json: bool, infra_exit: int | Non
 
 
 async def release_token(token: str) -> TokenFile | None:
-    """End the hold of a token, and remove its file if the hold has ended already. Return None if `token` is no token.
-    Raises Failed."""
+    """End the hold, and remove the file if the hold has ended already. None: `token` is no token. Raises Failed."""
     path = token_files.find(token)
     if path is None:
         return None

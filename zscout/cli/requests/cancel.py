@@ -120,7 +120,7 @@ async def _end(named: str, word: str, *, every: bool, yes: bool, as_json: bool) 
 
 
 def _choose(state: RcmState, named: str, word: str, *, every: bool) -> list[Target]:
-    """Return the ARCs that `named` means. Raises Failed if there is none, or, without `every`, more than one."""
+    """Raises Failed if there is none, or, without `every`, more than one."""
     known = [Target(hold.arc, hold.id, hold.client, "running", hold.who) for hold in state.holds]
     known += [Target(wait.arc, wait.id, wait.client, "queued", wait.who) for wait in state.queue]
     matching = [target for target in known if named in (target.arc, target.id, target.full_name)]

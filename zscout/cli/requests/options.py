@@ -79,7 +79,7 @@ SECONDS_OR_0: Final = Parsed("duration", lambda text, option: float(parse_durati
 
 
 def parse_comment(text: str, option: str) -> str:
-    """Check a comment, and return it as other users see it. Raises BadInput."""
+    """As other users see it. Raises BadInput."""
     try:
         return checked_comment(text)
     except ValueError as error:
@@ -125,8 +125,8 @@ def parse_need(text: str, _option: str = "") -> tuple[str, dict[str, Decimal]]:
 
 
 def gather_needs(pairs: Sequence[tuple[str, dict[str, Decimal]]]) -> Needs:
-    """Collect the needs of an ARC; a repeated pattern is numbered: `framegrabber/*#2` is the second. Raises BadInput
-    for too many needs, an RC named twice, or patterns that contradict each other."""
+    """A repeated pattern is numbered: `framegrabber/*#2` is the second. Raises BadInput for too many needs, an RC named
+    twice, or patterns that contradict each other."""
     if len(pairs) > MAX_NEEDS:
         raise BadInput(f"{len(pairs)} devices; at most {MAX_NEEDS} are allowed in one request")
     needs: Needs = {}
@@ -147,9 +147,6 @@ def gather_needs(pairs: Sequence[tuple[str, dict[str, Decimal]]]) -> Needs:
     except ValueError as error:
         raise BadInput(str(error)) from None
     return needs
-
-
-# Commands that hold devices
 
 
 def is_descriptor(target: str) -> bool:
@@ -200,8 +197,8 @@ class HoldCommand(click.Command):
 
 
 def _infra_exit_in(args: Sequence[str]) -> int | None:
-    """Return the value of --infra-exit before other options are parsed, since any of them may be wrong. None if it is
-    missing or bad; click then reports it."""
+    """The value of --infra-exit before other options are parsed, since any may be wrong. None: missing, or bad (click
+    reports it)."""
     for at, arg in enumerate(args):
         name, equals, value = arg.partition("=")
         if name == INFRA_EXIT:
@@ -428,7 +425,7 @@ def gather(
 
 
 def arc_named(text: str, _option: str) -> str:
-    """Check the name of an ARC, its id or `<host>/<client>/<id>`. Raises BadInput."""
+    """Raises BadInput."""
     if not text or len(text) > MAX_ARC_NAME or not text.isprintable():
         raise BadInput(f"{quoted(text)} can't be the name of a request; see zscout status")
     return text

@@ -161,7 +161,7 @@ async def carry_out(client: Client, wanted: HoldOptions) -> int:
 
 
 async def wait_for_grant(client: Client, wanted: HoldOptions, report: Report, arc: OpenArc | None) -> OpenArc:
-    """Wait until the request is granted. Raises Failed if it is not."""
+    """Raises Failed if the request is not granted."""
     try:
         once = wanted.timeout == 0
         async with (
@@ -297,8 +297,8 @@ async def _report_dates(report: Report, held: Held, client: Client) -> None:
 async def report_notices(
     report: Report, held: Held, client: Client, noticed: Callable[[HoldNotice, str], object] = lambda *_: None
 ) -> None:
-    """Report the next booking of each device, and each notice until the hold is over; call `noticed` with each notice
-    and its words."""
+    """Report the next booking of each device, and each notice until the hold is over; call `noticed` with it and its
+    words."""
     async with common.beside(_report_dates(report, held, client)):
         await _report_each(report, held, User.of(client), noticed)
 
@@ -328,7 +328,7 @@ def _never_suspended(report: Report) -> Iterator[None]:
 
 
 async def _run(wanted: HoldOptions, report: Report, held: Held, client: Client) -> int | None:
-    """Run the command. Return its exit code; None: the hold is over, and the command was ended."""
+    """Return its exit code; None: the hold is over, and the command was ended."""
     direct, program = client.internals.direct_hold(held.grant), wanted.command[0]
     until = direct.sure_until if direct is not None else None
     command = RunningCommand(wanted.command, environment(held, client), _grace(wanted, report, direct), until)
@@ -389,8 +389,7 @@ def _grace(wanted: HoldOptions, report: Report, direct: DirectHold | None) -> fl
 
 
 async def _after_loss(client: Client, wanted: HoldOptions, report: Report, arc: OpenArc) -> int | None:
-    """Report that the grant was taken away. Return the exit code, or None to wait again. Raises Failed if there is
-    neither a command nor --again."""
+    """Return the exit code, or None to wait again. Raises Failed with neither a command nor --again."""
     ending = ending_of(arc)
     # A hold that lost an RC after its minimum runtime is not queued again.
     again = wanted.again and (arc.open or ending.outcome == "lost")
@@ -430,7 +429,7 @@ def ending_of(arc: OpenArc) -> HoldEnd:
 
 
 async def _dry_run(client: Client, wanted: HoldOptions) -> int:
-    """Print the estimated start and the requests that it would preempt now. Return 1 if no start can be estimated.
+    """Print the estimated start, and the requests that it would preempt now. Return 1 if no start can be estimated.
     Raises RequestRefused, NobodyThere."""
     predicted = await client.foresee(wanted.name, wanted.needs, **wanted.terms())
     if predicted is None:
@@ -510,7 +509,7 @@ class Report(LiveLine):
             self.hide()
 
     async def follow_wait(self, *, quiet: bool = False) -> None:
-        """Show why it waits. `quiet`: as events only, since an error will name the reason."""
+        """`quiet`: as events only, since an error will name the reason."""
         self._printed = None
         while True:
             if self._fetched_at is not None and self._arc is not None and self._arc.state == "queued":
@@ -615,7 +614,6 @@ def _how(arc: OpenArc) -> tuple[str, str, int | None]:
 
 
 def _reason_words(arc: OpenArc, client: Client) -> str:
-    """Words for the reason that the request waits, for the user of `client`, at this moment."""
     return reason_text(arc.reason, arc.why, (client.mesh.now() - arc._notified_at) / SECOND, User.of(client))
 
 

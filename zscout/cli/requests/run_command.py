@@ -52,7 +52,6 @@ def check_command(command: Sequence[str]) -> None:
 
 
 def environment(held: Held, client: Client) -> dict[str, str]:
-    """Return this process's environment with the variables of the hold."""
     return os.environ | hold_variables(held, client)
 
 
@@ -73,9 +72,7 @@ def hold_variables(held: Held, client: Client) -> dict[str, str]:
 
 
 class RunningCommand:
-    """A command, from its start to the end of its last process. An async context manager: at its exit no process of the
-    command is left.
-
+    """A command, from its start to the end of its last process. An async context manager: at its exit none is left.
     grace: seconds from SIGTERM to SIGKILL. until: as of `hold_until`. kept: a descriptor that the guardian keeps open
     until all processes have ended."""
 
@@ -138,13 +135,12 @@ class RunningCommand:
             self._close()
 
     def hold_until(self, at: Ns) -> None:
-        """End the command at this time, by the monotonic clock of the fleet's programs, unless a later time is given
-        before."""
+        """End the command at this time, by the monotonic clock of the fleet's programs, unless a later one is given."""
         self._send(f"until {at}")
 
     async def wait(self) -> int:
-        """Wait until no process of the command is left: processes that it left running are ended. Return its exit code,
-        128 + n if signal n ended it."""
+        """Wait until the command and all processes that it left are ended. Return its exit code, 128 + n by signal
+        n."""
         await self._wait_until_gone()
         return self._code if self._code >= 0 else 128 - self._code
 
@@ -163,8 +159,8 @@ class RunningCommand:
             self._send(f"end {at}")
 
     async def end(self) -> None:
-        """End all its processes, and return when they have ended: SIGTERM, then SIGKILL after the grace or when this is
-        cancelled. Processes of another user that can't be ended are reported and left."""
+        """Return when all its processes have ended: SIGTERM, then SIGKILL after the grace or when this is cancelled.
+        Processes of another user that can't be ended are reported and left."""
         self.terminate(now())
         try:
             await first_of(self._wait_until_gone(), self._stuck.wait())
@@ -186,8 +182,6 @@ class RunningCommand:
         if self.pid:
             self._tty.take_back(self.pid, restore=self._code != 0)
         self._tty.close()
-
-    # The guardian's protocol
 
     def _send(self, words: str) -> None:
         with contextlib.suppress(OSError):  # the guardian has ended
@@ -244,8 +238,6 @@ class RunningCommand:
             return
         print_line(f"zscout: {self._command[0]} was ended: its guardian was killed", sys.stderr)
         self._over()
-
-    # The terminal
 
     def _stopped(self, number: int) -> None:
         if number in (signal.SIGTTIN, signal.SIGTTOU):

@@ -26,8 +26,8 @@ def check_options(**options: Any) -> None:
 async def taking_up(
     client: Client, wanted: HoldOptions, *, name: str | None, priority: int | None, yes: bool
 ) -> HoldOptions:
-    """Return the request that takes up `wanted.booking`, a name or an id. Without a `name` the request has the
-    booking's. Raises BadInput if needs or `priority` differ from the booking's; Failed, RequestRefused."""
+    """The request that takes up `wanted.booking`, a name or an id; its own name is `name`, else the booking's. Raises
+    BadInput if needs or `priority` differ from the booking's; Failed, RequestRefused."""
     me = User.of(client)
     booking = choose((await ask_bookings(client)).bookings, wanted.booking, me)
     if booking.maintenance:

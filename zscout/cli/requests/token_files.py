@@ -49,16 +49,16 @@ class TokenFile(msgspec.Struct, frozen=True):
 
 
 class ToHolder(msgspec.Struct, frozen=True):
-    """A message to the holder process: `run` (with a descriptor, whose other end is closed when all processes of the
-    command have ended), `gone`, `renew`, `release`."""
+    """To the holder process: `run` (with a descriptor, whose other end is closed when all processes of the command have
+    ended), `gone`, `renew`, `release`."""
 
     op: str
     seconds: float = 0
 
 
 class FromHolder(msgspec.Struct, frozen=True, omit_defaults=True):
-    """A message from the holder process: `hold` (a command may run), `until`, `notice` (something will end the hold, in
-    words), `end`, `done`, `refused`."""
+    """From the holder process: `hold` (a command may run), `until`, `notice` (something will end the hold, in words),
+    `end`, `done`, `refused`."""
 
     op: str
     env: dict[str, str] = {}
@@ -91,8 +91,7 @@ class TokenChannel:
         self._socket = connection
 
     def send(self, word: msgspec.Struct, fds: Sequence[int] = ()) -> None:
-        """Send a message with descriptors. A message that can't be sent is dropped: the other process has ended, or has
-        not read for long."""
+        """A message that can't be sent is dropped: the other process has ended, or has not read for long."""
         with suppress(OSError):
             socket.send_fds(self._socket, [msgspec.json.encode(word)], fds)
 
@@ -126,9 +125,6 @@ async def readable(fd: int) -> None:
         await ready.wait()
     finally:
         loop.remove_reader(fd)
-
-
-# Files
 
 
 def folders() -> list[Path]:
@@ -203,9 +199,6 @@ def _socket_of(path: Path) -> Path:
     return path.with_suffix(".sock")
 
 
-# Sockets
-
-
 @contextmanager
 def _reachable(path: Path) -> Iterator[str]:
     """Yield a path of the socket that is short enough for the system."""
@@ -248,7 +241,7 @@ def accept(server: socket.socket) -> TokenChannel | None:
 
 
 def connect(path: Path) -> TokenChannel | None:
-    """Connect to the holder process of the token; None: it has ended."""
+    """None: its process has ended."""
     connection = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     try:
         with _reachable(_socket_of(path)) as name:

@@ -144,8 +144,6 @@ class TokenHolder:
         for channel in self._releasing:
             channel.send(FromHolder("done") if gave_back else FromHolder("refused", why="a command can't be ended"))
 
-    # How it ends
-
     def _end(self, ending: TokenEnding) -> None:
         if not self._ending.done():
             self._ending.set_result(ending)
@@ -166,8 +164,6 @@ class TokenHolder:
         if not path.exists():
             self._end(TokenEnding("the file of its token was removed"))
         return left
-
-    # Who uses it
 
     def _accept(self, server: Any) -> None:
         if (channel := token_files.accept(server)) is not None:
@@ -250,8 +246,7 @@ class TokenHolder:
 
 
 async def hold(client: Client, wanted: HoldOptions, seconds: float, follow: int | None, starter: TokenChannel) -> int:
-    """Wait for the devices, hand the token to the process that started this one, and hold. Raises Failed,
-    RequestRefused, BadInput."""
+    """Wait for the devices, hand the token to the starter, and hold. Raises Failed, RequestRefused, BadInput."""
     followed = _descriptor_of(follow)
     client.who = wanted.asked_by(client.who)
     with Report(wanted.name, client, as_json=wanted.as_json, stream=sys.stderr, events=wanted.events) as report:

@@ -69,8 +69,8 @@ class NeedContention:
 
 
 def contention_of(state: RcmState, needs: Collection[str], own: str = "") -> list[NeedContention]:
-    """Return the contention for each need, without holds of the request `own` (`<host>/<client>/<id>`). A device that
-    a need names does not meet a pattern."""
+    """Without holds of the request `own` (`<host>/<client>/<id>`). A device that a need names does not meet a
+    pattern."""
     holds = [hold for hold in state.holds if f"{hold.client}/{hold.id}" != own]
     views = {view.rc: view for view in state.rcs}
 
@@ -104,8 +104,8 @@ def whose(view: HoldView | WaitView | ReasonParty) -> str:
 def request_words(
     arc: str, who: Who | None, client: str, params: Mapping[str, Decimal] | None = None, me: User | None = None
 ) -> str:
-    """Name and person of a request: `survey (alice@ws1)`, with the `params` under which it holds a device; `your own
-    request survey` if it belongs to `me`."""
+    """`survey (alice@ws1)`, with the `params` under which it holds a device; `your own request survey` if it is
+    `me`'s."""
     name = _own_words(arc) if me is not None and me.owns(client.partition("/")[0], who) else named(who, client, arc)
     return clean(common.with_amounts(name, params or {}))
 
@@ -120,8 +120,8 @@ def comment(who: Who | None) -> str:
 
 
 def reason_text(reason: str, why: ReasonInfo | None, age: float = 0, me: User | None = None) -> str:
-    """Words for the reason that a request of `me` waits, `age` seconds after the leader sent it. Times of day are by
-    this host's clock."""
+    """Words for the reason that a request of `me` waits, `age` seconds after it was sent; times by this host's
+    clock."""
     known = reason_of(why)
     if known is None:
         return reason
@@ -163,7 +163,6 @@ def _until(hold: Mapping[str, Any], priority: int) -> str:
 
 
 def hold_json(hold: HoldView) -> dict[str, Any]:
-    """Return a hold for `--json`."""
     names = ("arc", "id", "client", "who", "priority", "keep", "protected_from")
     fields = {name: getattr(hold, name) for name in names}
     fields["waits"] = None if hold.waits is None else round(hold.waits, 3)

@@ -73,8 +73,8 @@ async def why(arc: str, as_json: bool) -> None:
 
 
 async def _past_holds(client: Client, arc: str, unknown: common.Failed) -> list[dict[str, Any]]:
-    """Return the latest holds of a request that the leader no longer knows, oldest first, as `zscout history --json`
-    prints them. Raises `unknown` if no journal has a hold."""
+    """The latest holds of a request unknown to the leader, oldest first, as of `zscout history --json`. Raises
+    `unknown` if no journal has a hold."""
     if len(arc) > MAX_ARC_NAME:
         raise unknown
     try:
@@ -87,8 +87,8 @@ async def _past_holds(client: Client, arc: str, unknown: common.Failed) -> list[
 
 
 async def _described(client: Client, view: View, state: RcmState) -> dict[str, Any]:
-    """Return an open request for `--json`, with its own story, without other requests of its name. In a hold `need`
-    is as requested, and `rc` the device that meets it."""
+    """With its own story, without other requests of its name. In a hold `need` is as requested, and `rc` the device
+    that meets it."""
     story = (await common.state_of(client, _full(view))).story
     met = {rc: need for need, rc in view.bound.items()} if isinstance(view, HoldView) else {}
     needs = []

@@ -41,8 +41,7 @@ def demo() -> None:
 
 
 class _Live:
-    """The Rerun viewer beside a demo: a window, or the server of a page for a browser. The page keeps its address when
-    the demo ends and its recording is shown."""
+    """The Rerun viewer beside a demo: a window, or a page for a browser, which keeps its address for the recording."""
 
     def __init__(self, stack: AsyncExitStack, *, web: bool) -> None:
         self._stack, self._web = stack, web
