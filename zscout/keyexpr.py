@@ -68,8 +68,8 @@ def is_pattern(need: str) -> bool:
 
 @lru_cache(CACHED_NAMES)
 def check_need(need: str) -> str:
-    """Return `need` if it names an RC or is a pattern: `kind/name` with `*` or `$*` in it, followed by `#2`, `#3` and
-    so on for further RCs by the same pattern in an ARC. Raises BadName."""
+    """Return `need` if it is an RC or a pattern: `kind/name` with `*` or `$*` in it, and `#2`, `#3` and so on for
+    further RCs by the same pattern. Raises BadName."""
     if not is_pattern(need):
         return check_rc(need)
     if _PATTERN.fullmatch(need) is None:
@@ -92,8 +92,8 @@ def host_in(need: str) -> str | None:
 
 @lru_cache(CACHED_NAMES)
 def check_maintained(need: str) -> str:
-    """Return `need` if it is valid for maintenance: an RC, a pattern for all matching RCs, or `@<host>` for all RCs of
-    a host. Raises BadName."""
+    """Return `need` if it is an RC, a pattern for all matching RCs, or `@<host>` for all RCs of a host. Raises
+    BadName."""
     if (host := host_in(need)) is None:
         return check_need(need)
     check_name(host, "host")
@@ -188,8 +188,6 @@ class Role:
 
 
 class _Key:
-    """A key expression that depends only on the fleet's name."""
-
     def __init__(self, suffix: str) -> None:
         self._suffix = suffix
 
@@ -198,7 +196,6 @@ class _Key:
 
 
 def _rc_key(suffix: str) -> Callable[[Keys, str], str]:
-    """A method of Keys that returns a key of an RC."""
     return lambda self, rc: f"{self.base}/rc/{check_rc(rc)}/{suffix}"
 
 
@@ -270,19 +267,15 @@ class Keys:
         return f"{self.base}/rc/{check_rc(rc)}/command/{_sender(sender)}"
 
     def confirm(self, host: str, sender: Sender) -> str:
-        """Key to ask all RCs of a host at once whether they know a grant."""
         return f"{self.base}/host/{check_name(host, 'host')}/confirm/{_sender(sender)}"
 
     def history(self, host: str, sender: Sender) -> str:
-        """Key to query a candidate's journal."""
         return f"{self.base}/host/{check_name(host, 'host')}/history/{_sender(sender)}"
 
     def placer(self, sender: Sender) -> str:
-        """Key of requests to the component placer."""
         return self._asked("placer/component", sender)
 
     def component(self, host: str, sender: Sender) -> str:
-        """Key of requests to a host's node about its components."""
         return self._asked(f"host/{check_name(host, 'host')}/component", sender)
 
     def component_any(self, sender: Sender) -> str:
@@ -316,8 +309,6 @@ class Keys:
         named = f"{self.base}/{key}/*/*"
         return (named,) if self.closed else (named, f"{self.base}/{key}")
 
-    # Liveliness
-
     def alive(self, token: Token) -> str:
         check_name(token.host, "host")
         check_name(token.role, "role")
@@ -326,11 +317,9 @@ class Keys:
         return f"{self.base}/alive/{token.host}/{token.role}/{name}/{token.instance}"
 
     def alive_rc(self, rc: str) -> str:
-        """Tokens of all instances of one RC."""
         return f"{self.base}/alive/*/{Role.RC}/{check_rc(rc)}/*"
 
     def alive_session(self, program: Sender) -> str:
-        """Tokens of all sessions of one program."""
         return f"{self.base}/alive/{program.host}/{Role.SESSION}/{program.client}/*"
 
     def alive_any(self, role: str = "*") -> str:
@@ -414,8 +403,8 @@ _NO_RANK: Final[frozenset[Rank]] = frozenset()
 
 
 class Access(NamedTuple):
-    """The ranks that may use a key. In `key`, `{by}` is the asking name; `{at}` the name that serves, publishes or
-    shows a token; `{rc}` an RC that it may serve. In the rules of other names they are `*`."""
+    """In `key`, `{by}` is the asking name; `{at}` the name that serves, publishes or shows a token; `{rc}` an RC that
+    it may serve. In the rules of other names they are `*`."""
 
     key: str
     ask: frozenset[Rank] = _NO_RANK
@@ -480,8 +469,8 @@ class FleetMember(NamedTuple):
 
 
 def access_control(keys: Keys, members: Collection[FleetMember]) -> dict[str, Any]:
-    """Zenoh's `access_control` for a session of this fleet: only members may send, under the name of their certificate
-    and as their ranks allow. Zenoh's rules have no templates, so each name has its own rules."""
+    """Zenoh's `access_control`: only members may send, under their certificates' names and as their ranks allow.
+    Zenoh's rules have no templates, so each name has its own."""
     out = {"id": "out", "permission": "allow", "flows": ["egress"], "messages": _EVERYTHING}
     read = {"id": "read", "permission": "allow", "flows": ["ingress"], "messages": ["declare_subscriber"]}
     watch = {"id": "watch", "permission": "allow", "flows": ["ingress"], "messages": list(_READ)}

@@ -30,8 +30,8 @@ REMEDIES: Final = {
 
 
 def shortage(error: BaseException | None) -> str:
-    """Describe a shortage of this host (disk, memory, descriptors, ...) or a file name that is not UTF-8, with the
-    remedy. Return "" for other errors, whose traceback may help."""
+    """A shortage of this host (disk, memory, descriptors, ...) or a file name that is not UTF-8, with the remedy; ""
+    for other errors, whose traceback may help."""
     if isinstance(error, BaseExceptionGroup):
         return next(filter(None, map(shortage, error.exceptions)), "")
     if isinstance(error, UnicodeEncodeError) and "\udc80" <= error.object[error.start] <= "\udcff":

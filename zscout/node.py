@@ -87,9 +87,8 @@ async def run_node(
 async def run_services(
     node: Node, mesh: Mesh, stop: asyncio.Event, reload: Reload | None = None, manager: ServiceManager | None = None
 ) -> None:
-    """Run the services of a node until `stop`, or until one fails. The recorder, the load reporter and the candidate
-    restart themselves; a failed RC or component host ends the node, in order. Raises BadInput if an RC's driver is
-    missing."""
+    """The recorder, the load reporter and the candidate restart themselves; a failed RC or component host ends the
+    node, in order. Raises BadInput if an RC's driver is missing."""
     me, failures = mesh.me, list[Exception]()
     manager = manager or ServiceManager()
     folder = functools.cache(functools.partial(state_folder, node.fleet.name, me.host, node.state))
@@ -219,7 +218,7 @@ async def run_services(
 
 
 def _look_for_twin(own: Token, other: Token, alive: bool) -> None:
-    """Log a second node with this name: both started without seeing each other, and both run."""
+    """Both started without seeing each other, and both run."""
     if alive and other.host == own.host and other.instance != own.instance:
         log.error("another node named %s is on the mesh too; end one, or set another host under [node]", own.host)
 
@@ -230,7 +229,6 @@ def _keeper(mesh: Mesh, node: Node, folder: Path | None) -> BookingKeeper:
 
 
 async def _cancelled(task: asyncio.Task[None]) -> None:
-    """Cancel a task, and wait for its end."""
     task.cancel()
     await asyncio.wait({task})
 
@@ -256,8 +254,7 @@ async def _serve_calendars(calendar: CalendarConfig, mesh: Mesh, fleet: str) -> 
 
 
 async def _serve(table: str, server: PlainHttpServer) -> bool:
-    """Start a server. Return False if another user of this machine has the port: the node runs without it. Raises
-    NodeFailed."""
+    """Return False if another user of this machine has the port: the node runs without it. Raises NodeFailed."""
     try:
         await server.start()
     except OSError as error:

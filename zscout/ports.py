@@ -16,8 +16,8 @@ TRIES: Final = 100
 
 
 def free_port(bind: str, *ports: int) -> int:
-    """Return the first free port among `ports` on this IP address. 0 is any port: a random port below the system's
-    ephemeral ports, which no connection takes before the server starts. Raises OSError."""
+    """The first free port among `ports` on this IP address. 0 is any: a random port below the system's ephemeral ports,
+    which no connection takes before the server starts. Raises OSError."""
     error = OSError("no port was given")
     for port in ports:
         for number in [port] if port else [*_any(), 0]:

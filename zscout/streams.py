@@ -15,8 +15,8 @@ ESCAPED: Final = "zscout.escaped"
 
 
 def open_standard_streams() -> None:
-    """Open closed descriptors among 0, 1 and 2 on /dev/null. Otherwise the next file or socket would get such a number,
-    and a library or child process would use it as a standard stream."""
+    """Open closed descriptors among 0, 1 and 2 on /dev/null: else the next file or socket would get such a number, and
+    a library or child process would use it as a standard stream."""
     for fd, name in enumerate(("stdin", "stdout", "stderr")):
         try:
             os.fstat(fd)

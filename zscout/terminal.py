@@ -61,7 +61,6 @@ def print_json(value: Any, stream: IO[str] | None = None) -> None:
 
 
 def json_text(value: Any) -> str:
-    """The text that `print_json` prints."""
     try:
         text = _JSON.encode(value).decode()
     except UnicodeEncodeError:  # a file name that is not UTF-8
@@ -89,10 +88,9 @@ def console(*, stderr: bool = False) -> Console:
 
 
 def clock(seconds: float) -> str:
-    """The time of day `seconds` from now (negative: ago), as this host's clock shows it in that instant: `14:32`,
-    `14:32:05` within two minutes of now, with the date on another day.
-
-    Rounded by `whole_second`, then down to the minute: an instant has one time, before and after it."""
+    """The time of day `seconds` from now (negative: ago), as this host's clock shows it then: `14:32`, `14:32:05`
+    within two minutes of now, with the date on another day. Rounded by `whole_second`, then down to the minute: an
+    instant has one time, before and after it."""
     now = datetime.now().astimezone()
     away = max(-MAX_CLOCK_S, min(seconds, MAX_CLOCK_S))
     at = datetime.fromtimestamp(whole_second(now.timestamp() + away)).astimezone()
@@ -113,12 +111,11 @@ Line = tuple[str, str]
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """Rows of texts, with control characters removed on printing. A newline in a cell is printed as a space; a cell
-    with newlines is broken over lines only there, any other cell at spaces.
-
-    `styles`: the Rich style of each row. `spare`: columns to remove on a narrow terminal, in this order; columns that
-    are also in `beneath` move to lines below each row. Texts in the columns `cut` are shortened before others are
-    broken. Long words in the columns `fold` are broken, not shortened, so that people can copy them."""
+    """Rows of texts, with control characters removed on printing. A cell with newlines is broken over lines only there,
+    any other at spaces; a newline is printed as a space. `styles`: the Rich style of each row. `spare`: columns to
+    remove on a narrow terminal, in this order; those also in `beneath` move to lines below each row. Texts in the
+    columns `cut` are shortened before others are broken. Long words in the columns `fold` are broken, not shortened, so
+    that people can copy them."""
 
     title: str
     columns: Sequence[str]
@@ -208,7 +205,6 @@ class Table:
 
 
 def _wide(text: str) -> int:
-    """Width of a text in terminal columns."""
     from rich.cells import cell_len
 
     return cell_len(text)
@@ -255,8 +251,8 @@ def print_table(columns: Sequence[str], rows: Sequence[Sequence[str]], *, title:
 
 
 class LiveLine:
-    """A picture redrawn in place at a terminal, with permanent lines printed above it. Nothing is drawn elsewhere, or
-    if not `shown`. A context manager, which removes the picture at the end unless it `stays`."""
+    """A picture redrawn in place at a terminal, if `shown`, with permanent lines printed above it. A context manager,
+    which removes the picture at the end unless it `stays`."""
 
     def __init__(self, stream: IO[str] | None = None, *, shown: bool = True, stays: bool = False) -> None:
         self._stream = stream or sys.stdout
@@ -295,7 +291,7 @@ class LiveLine:
             self._live.update(picture, refresh=True)
 
     def print(self, text: str, style: str = "") -> None:
-        """Print a permanent line above the picture."""
+        """Above the picture."""
         if self._live is None:
             print_line(clean(text), self._stream)
         else:
@@ -326,8 +322,8 @@ def progress(total: int) -> Iterator[Callable[[], None]]:
 
 @contextmanager
 def typed_keys(pressed: Callable[[bytes], None], ended: Callable[[], None]) -> Iterator[None]:
-    """Call `pressed` with each key typed at the terminal, and `ended` when the terminal is gone. Keys are delivered
-    singly and are not echoed; the terminal's mode is restored at the end."""
+    """Call `pressed` with each key typed, singly and without echo, and `ended` when the terminal is gone. The
+    terminal's mode is restored at the end."""
     import termios
     import tty
 

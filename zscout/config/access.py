@@ -74,8 +74,6 @@ class Ceiling(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class AccessPolicy(Struct, frozen=True, dict=True):
-    """The rights of all names of a fleet."""
-
     roles: Roles = Roles()
     groups: Mapping[str, tuple[str, ...]] = {}
     access: Mapping[str, tuple[str, ...]] = {}
@@ -85,7 +83,6 @@ class AccessPolicy(Struct, frozen=True, dict=True):
 
     @cached_property
     def ranks(self) -> Mapping[str, frozenset[Rank]]:
-        """The ranks of each name that has some."""
         found: dict[str, set[Rank]] = {}
         for rank in get_args(Rank):
             for name in getattr(self.roles, rank):
@@ -120,8 +117,7 @@ class AccessPolicy(Struct, frozen=True, dict=True):
         return allowed
 
     def quotas_of(self, name: str) -> Iterator[tuple[str, Collection[str], Quota]]:
-        """The quotas that apply to this name: the name or group that has the quota, the names that share it, and the
-        quota."""
+        """The name or group that has the quota, the names that share it, and the quota."""
         for owner in (name, *self.groups_of(name)):
             if owner in self.quotas:
                 yield owner, self.groups.get(owner, (owner,)), self.quotas[owner]
@@ -140,7 +136,6 @@ class AccessPolicy(Struct, frozen=True, dict=True):
         return self.refusal_text(name, what, [other for other, ranks in self.ranks.items() if ranks & {*needed}])
 
     def refusal_text(self, name: str, what: str, permitted: Collection[str]) -> str:
-        """The text that `name` may not do `what`, and which names may."""
         ranks, names = self.ranks_of(name), sorted(permitted)
         title = f"{name} ({', '.join(sorted(ranks))})" if ranks else f"{name}, which has no role here,"
         more = f" and {len(names) - MAX_NAMED} more" if len(names) > MAX_NAMED else ""

@@ -13,8 +13,8 @@ from typing import Any, Final
 
 PROCESS: Final = (sys.executable, "-P", "-m", "zscout.config.apprise_process")
 TIMEOUT: Final = 60.0
-"""Seconds for the whole process. By default Apprise takes at most 4 s to connect and 4 s for each answer; a URL can set
-other limits (`cto`, `rto`)."""
+"""Seconds. By default Apprise takes at most 4 s to connect and 4 s for each answer; a URL can set others (`cto`,
+`rto`)."""
 
 
 class NoAnswer(Exception):

@@ -98,8 +98,8 @@ class CertificateAuthority:
         return cls(folder, own, key, trusted)
 
     def issue(self, name: str, folder: Path, lasts: timedelta, now: datetime, *, manager: bool = False) -> datetime:
-        """Write the folder of this name's certificate, replacing its files; a manager's folder also gets the key that
-        seals places. Returns the end of the certificate, at the latest that of this CA. Raises BadInput."""
+        """Write this name's folder, replacing its files; a manager's also gets the key that seals places. Returns the
+        end of the certificate, at the latest that of this CA. Raises BadInput."""
         check_name(name, Where("NAME"))
         if manager:
             if (places := read_places_key(self.folder)) is None:
@@ -111,8 +111,8 @@ class CertificateAuthority:
         return self._write(folder, name, lasts, now, _new_key())
 
     def renew(self, folder: Path, lasts: timedelta, now: datetime, *, new_key: bool = False) -> datetime:
-        """Renew the certificate in this folder, expired or not, in place. It keeps its key, which need not be there,
-        unless `new_key`. Returns the new end. Raises BadInput if no CA in this CA's `ca.pem` issued it."""
+        """Renew the certificate in this folder, expired or not. It keeps its key, which need not be there, unless
+        `new_key`. Returns the new end. Raises BadInput if no CA in this CA's `ca.pem` issued it."""
         where = Where(str(folder / CERT))
         old = _parsed(read_text(folder / CERT, max_bytes=MAX_FILE).encode(), where)[0]
         if not any(_has_issued(ca, old) for ca in _parsed(self._trusted, Where(str(self.folder / CA)))):

@@ -102,8 +102,8 @@ class Certificates(Validity):
 
 
 def read_certificates(folder: Path) -> Certificates:
-    """Read a certificate's folder; an expired certificate is no error. Raises BadInput if a file is missing, broken or
-    open to others, if key and certificate do not match, if no CA in `ca.pem` issued it, or if its name is invalid."""
+    """An expired certificate is no error. Raises BadInput if a file is missing, broken or open to others, if key and
+    certificate do not match, if no CA in `ca.pem` issued it, or if its name is invalid."""
     import ssl
 
     instead = f"or name your own folder by ${KEYS_VARIABLE}"
@@ -157,8 +157,8 @@ def read_places_key(folder: Path) -> bytes | None:
 
 
 def read_cas(path: Path) -> list[Validity]:
-    """The CAs in a file. Raises BadInput, also for a certificate that is not a CA's: Zenoh would trust certificates
-    signed with its key."""
+    """Raises BadInput, also for a certificate that is not a CA's: Zenoh would trust certificates signed with its
+    key."""
     check_mode(path, 0o002, "644")
     store = _store(path)
     count = store.cert_store_stats()
@@ -201,8 +201,7 @@ def _store(path: Path) -> ssl.SSLContext:
 
 
 def _shake_hands(client: ssl.SSLContext, server: ssl.SSLContext, trusted: str) -> dict[str, Any]:
-    """Connect both sides in memory, each checking the other's certificate; return the parsed certificate. Raises
-    SSLError."""
+    """Connect both sides in memory, each checking the other; return the parsed certificate. Raises SSLError."""
     import ssl
 
     client.check_hostname = False
@@ -220,7 +219,7 @@ def _shake_hands(client: ssl.SSLContext, server: ssl.SSLContext, trusted: str) -
 
 
 def validity(parsed: Mapping[str, Any], where: Where) -> Validity:
-    """Name and validity of a certificate that `ssl` has parsed. Raises BadInput."""
+    """Raises BadInput."""
     from ssl import cert_time_to_seconds
 
     try:

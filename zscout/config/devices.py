@@ -279,8 +279,8 @@ def _check_rc(rc: BuiltInRc, at: Where) -> None:
 
 
 def parse_region(text: str) -> list[float]:
-    """The numbers of a region: x and y of each corner in turn, as shares of the picture's width and height from the
-    upper left. Two corners are opposite ones of a rectangle. Raises ValueError."""
+    """x and y of each corner in turn, as shares of the picture's width and height from the upper left; two corners are
+    opposite ones of a rectangle. Raises ValueError."""
     parts = text.split(",")
     numbers = [float(part) for part in parts if _SHARE.fullmatch(part.strip()) and float(part) <= 1]
     if len(numbers) < len(parts):

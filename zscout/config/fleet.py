@@ -91,8 +91,8 @@ class MeshConfig(MeshTable, frozen=True):
 
     @property
     def known_by(self) -> tuple[str, ...]:
-        """Addresses that identify this mesh to all processes of a host: the multicast address, or without it the
-        endpoints of the fleet file."""
+        """Addresses by which all processes of a host know this mesh: of multicast, without it the fleet file's
+        endpoints."""
         return (
             (self.multicast_address,) if self.multicast else self.shared or tuple(sorted({*self.listen, *self.connect}))
         )
@@ -100,7 +100,7 @@ class MeshConfig(MeshTable, frozen=True):
 
 class SecurityTable(Struct, frozen=True, forbid_unknown_fields=True):
     """The table [security]: the mesh admits only holders of the fleet's certificates. The folder has `ca.pem`,
-    `cert.pem` and `key.pem`; the certificate's name is that host or person. [roles] has the rights of each name."""
+    `cert.pem` and `key.pem`, in that host's or person's name, whose rights are in [roles]."""
 
     folder: Annotated[
         str, key("The folder of the certificate, relative to this file; `~` is the home.", example="/etc/zscout/keys")
@@ -138,8 +138,7 @@ class RcmLimits(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Timing(Struct, frozen=True, forbid_unknown_fields=True):
-    """The table [timing]: timing of the RCM and of RCs, in ns. `hold_lease` exceeds two heartbeats, and the mesh lease
-    plus `rebuild`."""
+    """The table [timing], in ns. `hold_lease` exceeds two heartbeats, and the mesh lease plus `rebuild`."""
 
     heartbeat: Annotated[Ns, seconds("0.05", "10", "The longest time between two publications of the RCM.")] = (
         SECOND // 2
@@ -202,20 +201,15 @@ class Fleet(Struct, frozen=True):
 
     @property
     def operator_priority(self) -> int:
-        """ARCs of this priority and above are an operator's."""
         return self.scheduling.operator_priority
 
     @property
     def silence(self) -> Ns:
-        """A leader without publications for this long, in ns, hangs or is gone: four heartbeats, at least a mesh
-        lease."""
+        """A leader without publications for this long, in ns, hangs or is gone: 4 heartbeats, at least a mesh lease."""
         return max(4 * self.timing.heartbeat, round(self.mesh.lease * SECOND))
 
     def may_lead(self, host: str) -> bool:
         return not self.candidates or host in self.candidates
-
-
-# The tables of the file
 
 
 class FleetTable(Struct, frozen=True, forbid_unknown_fields=True):
@@ -261,8 +255,7 @@ class FleetTable(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class FairSharesTable(Struct, frozen=True, forbid_unknown_fields=True):
-    """The table [fair_shares]: within one priority, groups with less recent contended usage go first. Without the table
-    groups do not matter."""
+    """Within one priority, groups with less recent contended usage go first; without the table groups do not matter."""
 
     half_life: Annotated[Ns, seconds("60", "31622400", "After this long usage counts half.")] = DAY
     weights: Annotated[
@@ -321,7 +314,6 @@ def load_fleet(path: Path, named_by: str = "") -> Fleet:
 
 
 def default_fleet() -> Fleet:
-    """The fleet without a file."""
     return _fleet(FleetFile(), Where("defaults"))
 
 
@@ -409,8 +401,7 @@ def keys_folder(table: SecurityTable, beside: Path, top: Where) -> Path:
 
 
 def check_security(fleet: Fleet, top: Where) -> None:
-    """Check that a secured fleet has managers, TLS endpoints, and candidates and devices that the roles allow. Raises
-    BadInput."""
+    """Raises BadInput unless managers, TLS endpoints, and candidates and devices that the roles allow are there."""
     if fleet.security is None:
         return
     access = fleet.access
@@ -456,9 +447,6 @@ def _check_timing(timing: Timing, lease: float, at: Where) -> None:
         if timing.hold_lease <= bound:
             remedy = f"write more than {meaning}, which is {bound / SECOND:g} s"
             raise (at / "hold_lease").bad(f"is {timing.hold_lease / SECOND:g} s", remedy)
-
-
-# Endpoints and addresses, checked before Zenoh sees them
 
 
 def check_links(listen: tuple[str, ...], connect: tuple[str, ...], interface: str, at: Where) -> None:
@@ -518,7 +506,7 @@ def beside(mesh: MeshConfig) -> MeshConfig:
 
 
 def ip_of(text: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
-    """Parse an IP address; None if it is not one."""
+    """None: it is not one."""
     try:
         return ipaddress.ip_address(text)
     except ValueError:

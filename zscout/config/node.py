@@ -136,9 +136,6 @@ class Node(Struct, frozen=True):
     """Folder for files that outlive the node (`state_folder.py`); None: the user's default."""
 
 
-# The tables of the file
-
-
 class NodeTable(Struct, frozen=True, forbid_unknown_fields=True):
     """The table [node]."""
 

@@ -19,8 +19,8 @@ EXTRAS: Final = {"apprise": "apprise", "cryptography": "cryptography", "promethe
 
 
 def how_to_get(error: ImportError) -> str:
-    """Name the missing package of this import error and the command that installs it, as `needs numpy, ...`, to follow
-    the name of a feature. "" for any other module."""
+    """The missing package of this error and the command that installs it, as `needs numpy, ...`, to follow the name of
+    a feature. "" for any other module."""
     package = (MODULES | EXTRAS).get((error.name or "").partition(".")[0])
     if package is None or not isinstance(error, ModuleNotFoundError):
         return ""

@@ -55,8 +55,8 @@ class SchedulingPolicy:
     preempt_budget: float = PREEMPT_BUDGET
     """`adaptive`: once an ARC has lost this share of its minimum runtime to others, only operators preempt it."""
     patience: Ns | Literal["runtimes"] | None = "runtimes"
-    """`adaptive`: time in ns after which a waiting ARC is due (`reservations.py`); `runtimes`: it follows the minimum
-    runtimes (`patience.py`); None: never."""
+    """`adaptive`: when a waiting ARC is due, in ns (`reservations.py`); `runtimes`: by minimum runtimes; None:
+    never."""
     promise: Promise = "equals"
     """ARCs that may not pass a due ARC. `equals`: those of equal and lower priority; `all`: all but operators. With
     `all`, only operators preempt the due ARC's hold within its minimum runtime."""

@@ -134,10 +134,9 @@ def read_toml(path: Path, type: type[T], *, max_bytes: int = 1_000_000) -> T:  #
 
 
 def parse_toml(text: str, source: str, type: type[T]) -> T:  # noqa: A002 - msgspec's word
-    """Read TOML into a struct type; `source` names the file in errors. Raises BadInput, also for unknown keys.
-
-    Numbers with a point are read exactly, as Decimal. Struct fields may be Decimal, float, int, str, bool, Literal,
-    lists and tables of these, Any, structs and dataclasses."""
+    """`source` names the file in errors. Raises BadInput, also for unknown keys. Numbers with a point are read exactly,
+    as Decimal. Struct fields may be Decimal, float, int, str, bool, Literal, lists and tables of these, Any, structs
+    and dataclasses."""
     where = Where(source)
     if deep := _DEEP_KEY.search(text):
         line = text.count("\n", 0, deep.start()) + 1
@@ -233,8 +232,8 @@ def key(
     most: int | None = None,
     remedy: str = "",
 ) -> Meta:
-    """Description and bounds of a key, as metadata of a struct's field. `most`: greatest number of entries; `remedy`:
-    remedy in the error if a required key is missing."""
+    """Description and bounds of a field. `most`: greatest number of entries; `remedy`: in the error if it is
+    missing."""
     extra = {name: text for name, text in (("unit", unit), ("remedy", remedy)) if text}
     bounds: dict[str, Any] = {"ge": low, "le": high, "max_length": most}
     examples = None if example is None else [example]
@@ -260,8 +259,7 @@ def seconds(low: str, high: str, description: str) -> Meta:
 
 
 def amounts(values: Mapping[str, Decimal], where: Where) -> dict[str, Fraction]:
-    """Convert bandwidth parameters or capacities exactly, so that 0.1 + 0.2 is 0.3. Raises BadInput for a negative
-    value."""
+    """Exactly, so that 0.1 + 0.2 is 0.3. Raises BadInput for a negative value."""
     for name, value in values.items():
         if value < 0:
             raise (where / name).bad(f"is {value}", "write 0 or more")
@@ -346,7 +344,6 @@ def _seconds(value: object, where: Where) -> object:
 
 
 def _tagged(structs: Iterable[inspect.Type], table: Mapping[str, object], where: Where) -> inspect.StructType:
-    """Select the struct by the table's tag."""
     known = {str(struct.tag): struct for struct in structs if isinstance(struct, inspect.StructType)}
     tag_field = str(next(iter(known.values())).tag_field)
     if tag_field not in table:

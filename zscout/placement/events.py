@@ -24,9 +24,7 @@ class _OnHost:
 @dataclass(frozen=True, slots=True)
 class StartAnswered(_OnHost):
     """`ok` (runs or is on standby), `refused` (another host may accept), `failed` (ended, or was not ready), `unknown`
-    (no answer).
-
-    `again`: another try on this host could help."""
+    (no answer). `again`: another try on this host could help."""
 
     result: Literal["ok", "refused", "failed", "unknown"]
     reason: str = ""
@@ -66,8 +64,8 @@ class TokenVanished(_OnHost):
 
 @dataclass(frozen=True, slots=True)
 class ComponentsListed:
-    """A host's reply to ListComponents, or its list at a change of leader: all its components, or `only` one.
-    `kinds`: kinds it can start; None: unknown."""
+    """A host's reply to ListComponents, or its list at a change of leader: all its components, or `only` one. `kinds`:
+    kinds it can start; None: unknown."""
 
     host: HostName
     components: Sequence[messages.ComponentView]
@@ -125,8 +123,7 @@ class ComponentChanged:
 
 @dataclass(frozen=True, slots=True)
 class PlacementRefused:
-    """`code` as in docs/protocol/errors.md, `message` one line. `subject`: the component, or the host that can't be
-    drained."""
+    """`code` as in docs/protocol/errors.md; `message` is one line; `subject`: the component, or the host to drain."""
 
     subject: str
     code: str

@@ -228,8 +228,8 @@ class Lifecycle:
         state.wake(record, at)
 
     def check(self, record: ComponentRecord) -> Termination | None:
-        """Probe a running component without token or confirmation, and reset the restarts of a settled one. Returns
-        how it ended, if lost."""
+        """Probe a running component without token or confirmation; reset a settled one's restarts. Returns its end, if
+        lost."""
         state, host = self.state, record.host
         if record.running_since is not None and state.now - record.running_since >= state.rules.settled:
             record.restarts = 0
@@ -296,8 +296,6 @@ class Lifecycle:
         elif record.restarts >= self.state.rules.restarts:
             self._finish(record, "given_up", f"{cause}; {record.restarts} starts in a row failed")
         return record.state == "given_up"
-
-    # Stopping makes an incarnation surplus
 
     def end_incarnation(self, record: ComponentRecord) -> None:
         state, host = self.state, record.host

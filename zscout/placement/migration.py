@@ -257,8 +257,6 @@ class Migrations:
         record.enter("running")
         state.wake_migration(record, None)
 
-    # Drained hosts take no placements; movable components leave, heaviest first
-
     def drain(self, host: HostName) -> None:
         """Drain a host. An unknown one is refused: it is likely a typo."""
         state = self.state

@@ -31,10 +31,9 @@ LEAST: Final = 0.01
 
 
 class Profile(NamedTuple):
-    """Known or assumed use of a kind: `cpu` in cores of speed 1.0, `memory` in bytes.
-
-    `threads`: the most cores it wants, however slow. A component that computes all the time wants one core on any
-    host; a paced one wants less of a faster host."""
+    """Known or assumed use of a kind: `cpu` in cores of speed 1.0, `memory` in bytes. `threads`: the most cores it
+    wants, however slow. A component that computes all the time wants one core on any host; a paced one wants less of a
+    faster host."""
 
     cpu: float = 0.25
     memory: int = 64_000_000
@@ -62,8 +61,7 @@ class Profile(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class RankQuery:
-    """Requirements of a component: all `labels`, and `memory` bytes available. `hosts`: only these; None: all that
-    report."""
+    """`labels`: all of them; `memory`: bytes available; `hosts`: only these; None: all that report."""
 
     kind: Kind = ""
     metric: Metric = "composite"
@@ -98,8 +96,8 @@ NO_REPORT: Final = Unfit("no report of it")
 
 @dataclass(frozen=True, slots=True)
 class Ranking:
-    """Hosts best first; `why`: how `metric` was chosen; `more`: ranked hosts not listed; `left_out`: why others
-    can't be used."""
+    """Best first; `why`: how `metric` was chosen; `more`: ranked hosts not listed; `left_out`: why others can't be
+    used."""
 
     hosts: tuple[RankedHost, ...]
     metric: Metric

@@ -32,7 +32,7 @@ from zscout.types import ComponentId, HostName, Ns
 
 class Placer:
     """`balancer` knows the hosts and learns placements; `counter` of the term makes incarnations higher than earlier
-    terms'."""
+    ones."""
 
     def __init__(self, balancer: Balancer, counter: int, rules: PlacementPolicy = DEFAULT_PLACEMENT) -> None:
         self._state = state = PlacementState(balancer, counter, rules)
@@ -53,7 +53,6 @@ class Placer:
 
     @property
     def maintained(self) -> list[HostName]:
-        """The hosts that are cordoned for as long as they are in maintenance."""
         return sorted(self._migrations.maintained)
 
     def handle(self, now: Ns, *batch: events.PlacerEvent) -> list[events.PlacerEffect]:

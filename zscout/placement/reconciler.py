@@ -49,8 +49,7 @@ class Reconciler:
             self._given_twice(record, host, token=True)
 
     def vanished(self, token: TokenVanished) -> None:
-        """A component's token has vanished: it ended, for a cause that its host reports, or the network hides it for a
-        while."""
+        """A component has ended, for a cause that its host reports; or the network hides its token for a while."""
         component, incarnation = token.component, token.incarnation
         record = self.state.get(component)
         self.surplus.token(component, incarnation, alive=False)
@@ -69,8 +68,8 @@ class Reconciler:
             move.token, move.target = False, "unknown"
 
     def _given_twice(self, record: ComponentRecord, host: HostName, *, token: bool) -> None:
-        """Two separated placers gave one number twice. Of two live incarnations the one on the greater host
-        continues, which the hosts decide too when they meet."""
+        """Two separated placers gave one number twice. Of two live incarnations the greater host's continues, as the
+        hosts decide too when they meet."""
         state, other = self.state, record.host
         if other is None or other == host:
             return

@@ -131,7 +131,7 @@ class SurplusIncarnations:
 
 
 class Probes:
-    """Components to ask a host for until it answers: with unexpected tokens, or on it when it was lost."""
+    """With unexpected tokens, or on a host when it was lost; asked about until it answers."""
 
     def __init__(self, state: PlacementState) -> None:
         self._state = state

@@ -69,8 +69,7 @@ SideState: TypeAlias = Literal["unknown", "running", "standby", "ended"]
 
 @dataclass(frozen=True, slots=True)
 class Termination:
-    """`lost`: the cause is unknown. `with_host`: its host ended, so it is not the component's failure. `bad_params`:
-    it would fail again."""
+    """`lost`: cause unknown. `with_host`: its host ended; not its failure. `bad_params`: it would fail again."""
 
     cause: HowEnded | Literal["lost"]
     reason: str
@@ -85,8 +84,8 @@ def host_gone(host: HostName | None) -> Termination:
 
 @dataclass(slots=True)
 class Migration:
-    """A move: the target starts (`starting`), the source hands over (`handing_over`), or both hosts are asked for
-    the outcome (`probing`)."""
+    """The target starts (`starting`), the source hands over (`handing_over`), or both are asked how it ended
+    (`probing`)."""
 
     to: HostName
     incarnation: Incarnation
@@ -185,7 +184,7 @@ class Timers:
         self._heap: list[tuple[Ns, TimerKey]] = []
 
     def set(self, kind: TimerKind, name: str, at: Ns | None) -> None:
-        """Set the time of this key; None removes it."""
+        """None removes it."""
         key = kind, name
         if at is None:
             self._at.pop(key, None)
@@ -392,7 +391,6 @@ class PlacementState:
         self.timers.set(TimerKind.MIGRATION, record.component, at)
 
     def drain_soon(self, host: HostName | None) -> None:
-        """Check for components to move off this host, if it is drained."""
         if host in self.balancer.cordoned:
             self.timers.set(TimerKind.DRAIN, "", self.now)
 

@@ -27,8 +27,8 @@ _NETWORK: Final = Context()
 
 @dataclass(frozen=True, slots=True)
 class Disturbance:
-    """Probabilities that a message is lost, arrives twice, or arrives up to `by` seconds late so that others overtake
-    it; `old`: that an answer repeats the previous answer on its key."""
+    """Probabilities that a message is lost, arrives twice, or up to `by` seconds late, so that others overtake it;
+    `old`: that an answer repeats the previous one on its key."""
 
     lost: float = 0.0
     twice: float = 0.0
@@ -55,8 +55,8 @@ class End(Protocol):
 
 
 class MemoryLink:
-    """One direction between two processes. A message takes `delay` seconds and up to `jitter` more; it is lost with
-    probability `loss`."""
+    """One direction between two processes. A message takes `delay` s and up to `jitter` more; `loss` is a
+    probability."""
 
     def __init__(self, source: End, target: End, delay: float, chances: random.Random, trace: Trace | None) -> None:
         self.loop = source.loop
@@ -91,8 +91,8 @@ class MemoryLink:
         return probability > 0 and self._random.random() < probability
 
     def send(self, call: Callable[..., None], *args: Any, last: bool = False, late: float | None = None) -> None:
-        """Deliver `call(*args)` at the target. `late`: seconds of additional delay, in which others may overtake it.
-        `last`: send it even over a lost link."""
+        """Deliver `call(*args)` at the target. `late`: additional seconds, in which others may overtake it. `last`:
+        send it even over a lost link."""
         if self.loop.is_closed():  # garbage collection undeclares tokens even then
             return
         if self.source is self.target:
@@ -125,8 +125,7 @@ class MemoryLink:
         return True
 
     def lose_unsent(self, sent: int | None = None) -> None:
-        """Keep the first `sent` messages under way (None: a random number) and the notice that the source is gone,
-        which the network sends."""
+        """Keep `sent` messages under way (None: a random number) and the notice that the source is gone."""
         if self.queue:
             queue = sorted(self.queue)
             sent = self._random.randint(0, len(queue)) if sent is None else sent

@@ -50,7 +50,6 @@ def _memory(mesh: Mesh) -> MemoryMesh:
 
 
 def _node(mesh: Mesh) -> MemoryTransport:
-    """Return its current session."""
     node = _memory(mesh)._transport.current
     assert isinstance(node, MemoryTransport)  # noqa: S101
     return node
@@ -120,8 +119,7 @@ class MemoryNetwork:
         return self._session()
 
     def cut_where(self, is_cut: Callable[[str, str], bool]) -> None:
-        """Cut each link, also of later sessions, for which `is_cut(source, target)` is true of the names of its
-        processes."""
+        """Cut each link, also of later sessions, for which `is_cut(source, target)` is true of its processes' names."""
         self._is_cut = is_cut
         for link in self.links.values():
             link.cut = link.source is not link.target and is_cut(str(link.source), str(link.target))
