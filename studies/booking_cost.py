@@ -154,7 +154,7 @@ def on_shared_rcs(rounds: int, rcs: int, need: str = "") -> list[Row]:
         return effects
 
     def settle(effects: list[Effect]) -> None:
-        """Play all that follows, each ballot in an instant of its own."""
+        """Each ballot has an instant of its own."""
         asked = list[Propose]()
         while True:
             asked += [effect for effect in effects if isinstance(effect, Propose)]

@@ -70,7 +70,6 @@ def simulating(building: str, robots: int) -> Iterator[tuple[psutil.Process, dic
 
 
 def measure(building: str, robots: int, seconds: float) -> list[Row]:
-    """Rows for a building with `robots` watched cameras, measured over `seconds`."""
     plan = load_plan(shipped_plans()[building])
     plan_robots = plan.robots[:robots]
     if len(plan_robots) < robots:

@@ -91,7 +91,6 @@ class Sequence:
     folder: Path
 
     def frames(self) -> Iterator[tuple[int, Picture, Picture]]:
-        """Yield number, picture and truth of all frames in order."""
         for path in sorted((self.folder / "input").glob("in*.jpg")):
             number = path.stem.removeprefix("in")
             picture = cv2.imread(str(path))
@@ -102,7 +101,6 @@ class Sequence:
 
     @property
     def counted(self) -> tuple[int, int]:
-        """The first and the last counted frame."""
         first, last = (self.folder / "temporalROI.txt").read_text(encoding="ascii").split()
         return int(first), int(last)
 

@@ -24,8 +24,6 @@ from zscout.placement.balancer import Balancer
 
 
 class Count:
-    """Counts the calls of a method."""
-
     def __init__(self) -> None:
         self.calls = 0
 

@@ -59,7 +59,6 @@ async def asked(client: Client) -> float:
 
 
 async def cost(folder: Path, rounds: int) -> list[Row]:
-    """Measure a fleet with certificates and a plain fleet in turn."""
     more = [f"more{number}" for number in range(NAMES - 7)]
     roles = ROLES.replace('viewer = ["wall"]', f'viewer = ["wall", {", ".join(map(repr, more))}]')
     (folder / "closed").mkdir()

@@ -195,7 +195,7 @@ def rows_of(robots: int, samples: Samples, rate: float, shares: list[float]) -> 
 
 
 def spent(processes: list[psutil.Process]) -> float:
-    """The processor time of all processes, in seconds."""
+    """In seconds."""
     total = 0.0
     for process in processes:
         with suppress(psutil.NoSuchProcess):

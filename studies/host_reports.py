@@ -66,8 +66,8 @@ class Host:
 
 
 async def reports(hosts: list[Host], stop: asyncio.Event) -> int:
-    """Report for each host once a second, evenly spaced, until `stop`. Return the number of reports. Late reports are
-    caught up, but at most MOST at once, so that a machine that is too slow sends fewer."""
+    """Report for each host once a second, evenly spaced, until `stop`. Return the number of reports. Late ones are
+    caught up, at most MOST at once, so that a machine that is too slow sends fewer."""
     loop = asyncio.get_running_loop()
     start, sent = loop.time(), 0
     while not stop.is_set():

@@ -108,7 +108,6 @@ async def rank(client: Client) -> HostRanking | None:
 
 
 async def ranked(client: Client, hosts: int) -> None:
-    """Wait until all hosts are ranked."""
     async with asyncio.timeout(HANG):
         while True:
             answer = await rank(client)
@@ -118,7 +117,6 @@ async def ranked(client: Client, hosts: int) -> None:
 
 
 async def measure(folder: Path, hosts: int, quiet: float = QUIET, asked: float = ASKED) -> Figures:
-    """Measure a node with this number of hosts."""
     with ExitStack() as stack:
         lab = Lab(folder, candidates=["lead"])
         file = folder / "lead.toml"

@@ -88,7 +88,6 @@ class Net:
         self.on(host, "route", "replace", "224.0.0.0/4", "dev", card)
 
     def rename(self, host: str) -> None:
-        """Replace the host's address by a new address."""
         old = self.addresses[host]
         self.addresses[host] = new = f"{old.rpartition('.')[0]}.{next(self._numbers)}"
         self.on(host, "addr", "del", f"{old}/24", "dev", "eth0")

@@ -44,9 +44,6 @@ HEARTBEAT: Final = 0.5
 Function = ast.FunctionDef | ast.AsyncFunctionDef
 
 
-# Measures of the source
-
-
 def sources(patterns: tuple[str, ...]) -> Iterator[ast.Module]:
     for path in itertools.chain.from_iterable(map(ROOT.glob, patterns)):
         yield ast.parse(path.read_text())
@@ -95,9 +92,6 @@ def callbacks(tree: ast.Module) -> Iterator[str]:
 
 def _is_self(value: ast.expr) -> bool:
     return isinstance(value, ast.Name) and value.id == "self"
-
-
-# Measures of running fleets
 
 
 async def one_grant(folder: Path) -> list[Row]:

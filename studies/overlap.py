@@ -80,8 +80,6 @@ class Begun(NamedTuple):
 
 
 class Programs:
-    """The starts that programs have recorded in a folder."""
-
     def __init__(self, folder: Path) -> None:
         self.folder = folder
 
@@ -109,7 +107,7 @@ class Taken(NamedTuple):
 
     @property
     def allowed(self) -> float:
-        """Seconds by rule 2: `settle` from the client's `leaving`, or a hold lease and `settle` from the RC's last
+        """Seconds by rule 2: `settle` from the client's `leaving`, or a hold lease and `settle` from the last
         confirmation."""
         lease = 0 if self.how == "preempted" else default_fleet().timing.hold_lease
         return (lease + DEFAULT_SETTLE) / SECOND
@@ -242,7 +240,7 @@ class Rounds:
         self._until("the former request has ended", lambda: request.process.poll() is not None)
 
     def _until(self, what: str, done: Callable[[], object], of: Request | None = None) -> None:
-        """Wait until `done`. Raises NeverCame if it takes too long, or if the request `of` has ended."""
+        """Raises NeverCame if it takes too long, or if the request `of` has ended."""
         deadline = time.monotonic() + WITHIN
         while not done():
             ended = of is not None and of.process.poll() is not None

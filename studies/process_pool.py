@@ -33,8 +33,8 @@ A = TypeVar("A")
 async def run_trials(
     work: Callable[[J], A], jobs: Sequence[J], processes: int | None, take: Callable[[A], None]
 ) -> None:
-    """Pass the answers of `work` to `take`, in the order of the jobs, with a progress bar at a terminal. By default
-    there are as many `processes` as processors. Raises the exceptions of `answers`."""
+    """Pass the answers of `work` to `take`, in the order of the jobs, with a progress bar at a terminal. Default: as
+    many `processes` as processors. Raises as `answers` does."""
     processes = processes or min(MAX_PROCESSES, len(os.sched_getaffinity(0)))
     with terminal.progress(len(jobs)) as advance:
         async with aclosing(answers(work, jobs, processes)) as found:
@@ -44,11 +44,9 @@ async def run_trials(
 
 
 async def answers(work: Callable[[J], A], jobs: Sequence[J], processes: int) -> AsyncGenerator[A, None]:
-    """Run `work`, a module-level function, on each job, and yield the answers in the order of the jobs. At its end no
-    process is left. Raises Failed if a process dies or can't start, BadInput if `work` raised it, and RuntimeError for
-    other exceptions of `work`.
-
-    Close the iterator (`contextlib.aclosing`) if you do not read it to its end."""
+    """Run `work`, a module-level function, on each job, and yield the answers in the order of the jobs. Close the
+    iterator (`contextlib.aclosing`) before its end: then no process is left. Raises Failed if a process dies or can't
+    start, BadInput if `work` raised it, and RuntimeError for other exceptions of `work`."""
     answered: asyncio.Queue[tuple[_Worker[J, A], A | Exception]] = asyncio.Queue()
     loop = asyncio.get_running_loop()
     workers: list[_Worker[J, A]] = []
@@ -122,9 +120,6 @@ class _Worker(Generic[J, A]):
         self._process.join()
         self._process.close()
         self.pipe.close()
-
-
-# In the processes
 
 
 def _serve(work: Callable[[J], A], pipe: Connection) -> None:

@@ -28,9 +28,8 @@ WRITE_SECONDS: Final = 10.0
 
 @contextmanager
 def recording(path: Path, application: str, blueprint: rrb.Blueprint, summary: str) -> Iterator[rr.RecordingStream]:
-    """A recording that replaces an existing file; `summary`, in Markdown, is shown beside its tabs.
-
-    Raises BadInput if the file can't be written."""
+    """Replaces an existing file; `summary`, in Markdown, is shown beside its tabs. Raises BadInput if the file can't be
+    written."""
     import rerun as rr
 
     stream = rr.RecordingStream(application)

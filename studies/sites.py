@@ -154,7 +154,6 @@ class Program(HolderProcess):
         return at
 
     async def works(self, arc: str, *rcs: str) -> None:
-        """Request and enter a hold, and command these RCs from now on."""
         await self.asks(arc, *rcs)
         await self.enters()
         self.disturbed = []
@@ -310,7 +309,6 @@ async def times(sites: Sites, rounds: int) -> dict[str, list[Ns]]:
 
 async def successions(sites: Sites, rounds: int) -> list[Ns]:
     """Times from `kill -9` of a holder in one site until the next holder, in the other site, has entered its body.
-
     Another program stays at each desk: a leader that loses the last programs of two hosts within a quarter of a lease
     assumes that it is cut off itself, and does not release the next lost client for a lease."""
     found = []

@@ -129,8 +129,7 @@ def _coverage(*words: str, check: bool = True) -> subprocess.CompletedProcess[st
 
 
 def _report(folder: Path, data: Path) -> dict[str, Any]:
-    """The summary of each file of this checkout, and its executed lines, by path. Tests that install zscout run files
-    that are gone by now."""
+    """The summary of each file of this checkout, and its executed lines, by path; not of files installed by tests."""
     report = folder / "report.json"
     _coverage("json", "-q", "--ignore-errors", f"--data-file={data}", "-o", str(report))
     files: dict[str, Any] = json.loads(report.read_text())["files"]

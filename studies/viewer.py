@@ -57,8 +57,6 @@ def progress(text: str) -> None:
 
 
 class Repeated(Timeline):
-    """A run that is recorded several times in succession."""
-
     shift = 0.0
 
     def log(self, at: float | None, entity: str, *what: object) -> None:
@@ -82,15 +80,13 @@ class Measured(Timeline):
 
 
 class Unfinished(Repeated):
-    """A recording without finishing."""
-
     def _finish(self, path: Path, layout: Layout) -> None:
         pass
 
 
 def record(path: Path, megabytes: float, kind: type[Repeated] = Repeated) -> None:
-    """Write a recording of four robots at work, with cameras, floor, loads and events, of about this size. With 0
-    megabytes only its first instant: all panes, but empty."""
+    """Four robots at work, with cameras, floor, loads and events, of about this size. With 0 megabytes only the first
+    instant: all panes, but empty."""
     with kind("lab", path=path) as timeline:
         while True:
             timeline.robots = RobotTracker(timeline)

@@ -126,8 +126,6 @@ class Checker:
         elif handler is not None:
             handler(host, event)
 
-    # Events of RCs
-
     def _rc(self, event: Json) -> None:
         rc, at, instance = event["rc"], event["at"], self._instances[event["rc"], event["instance"]]
         heard, holds = (_term(event["term"]), int(event["seq"])), frozenset(map(_grant, event["holds"]))
@@ -184,8 +182,6 @@ class Checker:
                     if event["at"] - max(event["since"], self._began.get((rc, grant), 0)) > HOLD_LEASE + SECOND // 2:
                         self.broken(event["at"], "7 silence ends holds", f"{rc} holds {grant} without a leader")
 
-    # Events of leaders
-
     def on_publish(self, host: str, event: Json) -> None:
         term = _term(event["term"])
         self._led[host] = event["at"]
@@ -204,8 +200,6 @@ class Checker:
         )
         if len(self._recent) > TERMS + causes:
             self.broken(at, "13 terms", f"{len(self._recent)} terms began within 10 s, with {causes} faults")
-
-    # Events of clients
 
     def on_asked(self, host: str, event: Json) -> None:
         self._open[host, event["id"]] = _Open(event)

@@ -147,7 +147,7 @@ class Peer:
         self.declare(lambda session: self._watched(session, on_token))
 
     def on_rc(self, rc: str, alive: bool) -> None:
-        """The token of an RC has appeared or disappeared."""
+        """An RC's token has appeared or disappeared."""
 
     def _watched(self, session: zenoh.Session, on_token: Callable[[zenoh.Sample], None]) -> Any:
         def on_sample(sample: zenoh.Sample) -> None:
@@ -633,8 +633,6 @@ class Client(Peer):
         view = request.asked | ({"place": request.place} if request.place is not None else {})
         return view | ({"grant": request.grant, "rcs": request.rcs} if request.grant is not None else {})
 
-    # Requests
-
     def schedule(self, schema: str, message: Json) -> list[tuple[bool, Json]]:
         replies = self.get(f"rcm/schedule/{self.me}", schema, message)
         for good, answer in replies:
@@ -737,7 +735,6 @@ class Client(Peer):
                 self.news.wait_for(lambda: request.grant != grant, 0.05)
 
     def serve_request(self, asked: Json, lasts: float, over: threading.Event) -> None:
-        """Serve a request from its start to its end."""
         request = Request(asked, due=now())
         with self.lock:
             self.requests[asked["id"]] = request

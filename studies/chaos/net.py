@@ -62,8 +62,7 @@ class Spaces(Protocol):
 
 
 class Net:
-    """All hosts on one bridge. Neighbours are static, so that a wrong hardware address cuts a way from one host to
-    another, silently and in one direction."""
+    """All hosts on one bridge. Neighbours are static: a wrong hardware address cuts one way between hosts, silently."""
 
     def __init__(self, hosts: Sequence[str]) -> None:
         self.hosts = list(hosts)
@@ -127,7 +126,7 @@ class Net:
                 raise RuntimeError(f"ip -batch: {errors}")
 
     def cut(self, ways: Iterable[tuple[str, str]]) -> None:
-        """Cut exactly these ways, and restore others."""
+        """Restores others."""
         wanted = set(ways)
         changed: dict[str, str] = {}
         for source, target in sorted(wanted ^ self.cuts):
@@ -150,7 +149,6 @@ class Net:
         ip("-n", self.space(host), "addr", "flush", "dev", "eth0")
 
     def give_address(self, host: str) -> None:
-        """Give the host a new address, which no host has had."""
         self._addresses[host] = next(self._further)
         ip("-n", self.space(host), "addr", "add", f"{self.address(host)}/16", "dev", "eth0")
         self._configure(host)
@@ -163,8 +161,6 @@ class Net:
 
 
 def remove(mark: str) -> None:
-    """Remove all namespaces, links and the bridge with this mark."""
-
     def run(*words: str) -> str:
         command = ["ip", *words]
         return subprocess.run(command, capture_output=True, text=True, check=False, timeout=COMMAND_TIMEOUT).stdout

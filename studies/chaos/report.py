@@ -33,7 +33,6 @@ def spread(values: Sequence[float]) -> Figures:
 
 
 def figures(faults: Sequence[Fault]) -> dict[str, Figures]:
-    """Figures of faults that came alone, by kind."""
     found = {}
     for kind in KINDS:
         alone = [fault for fault in faults if fault.kind == kind and fault.alone]

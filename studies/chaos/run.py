@@ -52,8 +52,6 @@ class NotServed(Exception):
 
 
 class Tail:
-    """The lines that a program has written since the last look."""
-
     def __init__(self, file: Path) -> None:
         self._file, self._at, self._rest = file, 0, b""
 
@@ -126,9 +124,7 @@ class Watch:
 
 class Fleet:
     """Three nodes, RCs and clients written from the protocol page alone, and zscout's own clients, each on its own
-    host.
-
-    At the end of the context only the folder remains."""
+    host. At the end of the context only the folder remains."""
 
     def __init__(self, folder: Path, seed: str, *, traced: bool = True) -> None:
         self.folder, self.seed = folder, seed
@@ -194,8 +190,6 @@ class Fleet:
         file.write_text(text)
         self._start(host, "zscout.node", str(file), "--log-level", self._log)
 
-    # Observing
-
     def look(self) -> None:
         self.watch.look()
         if gone := [host for host in HOSTS if host not in self.processes.pids() and host not in self._down]:
@@ -238,8 +232,6 @@ class Fleet:
 
     def _without_link(self) -> str:
         return ", ".join("-".join(sorted(pair)) for pair in PAIRS - self._standing.keys())
-
-    # Faults
 
     def begin(self, fault: Fault) -> None:
         fault.term, fault.began = self.watch.term[0], now()

@@ -61,7 +61,7 @@ def use(pid: int) -> Figures:
 
 
 def shorten(folder: Path) -> None:
-    """Truncate long logs, whose lines have been read."""
+    """Truncate logs whose lines have been read."""
     for log in folder.glob("*.log"):
         if log.stat().st_size > 20_000_000:
             with log.open("r+b") as file:
@@ -96,8 +96,8 @@ class Soaked(Simulation):
 
 
 def product_objects() -> int:
-    """Number of objects of zscout and of items in their containers, without the simulator's, whose checker remembers
-    all promises."""
+    """Number of objects of zscout and of items in their containers, without the simulator's: its checker remembers
+    all."""
     own = [thing for thing in gc.get_objects() if _is_product(thing)]
     seen, count = set(map(id, own)), 0
     while own:

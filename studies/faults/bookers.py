@@ -76,7 +76,7 @@ class MemoryDisk:
 
 
 class Hosts:
-    """The disks and clocks of hosts. `now` is virtual time."""
+    """`now` is virtual time."""
 
     def __init__(self, seed: int, hosts: list[str], now: Callable[[], float], *, booked: bool) -> None:
         rng = random.Random(f"hosts {seed}")  # noqa: S311 - what failed once must fail again
@@ -104,7 +104,6 @@ class Hosts:
         self._copies = {host: disk.content for host, disk in self.disks.items()}
 
     def fail(self, hosts: Iterable[str], *, fails: bool = True) -> None:
-        """Let writes to the disks of these hosts fail, or succeed again."""
         for host in hosts:
             self.disks[host].failing = fails
 

@@ -85,9 +85,9 @@ class Fact:
 
 
 class BookingPromises:
-    """Calls `broken(text)` for each broken promise. `keepers`: of live processes, by host; `disks`: of all hosts;
-    `wall`: the clock of each host; `calm`: return True without a present fault; `inside`: call a function in the
-    process of a host's node."""
+    """`broken(text)` is called for each broken promise. `keepers`: of live processes, by host; `disks`: of all hosts;
+    `wall`: the clock of each host; `calm`: True without a present fault; `inside`: calls a function in the process of a
+    host's node."""
 
     def __init__(
         self,
@@ -144,8 +144,6 @@ class BookingPromises:
         self._news: dict[str, set[str]] = {}
         """The same, collected during a look."""
 
-    # Answers to programs
-
     def asked(self, book: Book) -> Life:
         return self.lives.setdefault(book.id, Life(book))
 
@@ -191,8 +189,6 @@ class BookingPromises:
         if life is not None and arc.outcome == "preempted" and not life.book.maintenance:
             self._broken(f"{arc.name} is preempted for {life.book.name}, which was not taken up")
 
-    # Destruction of copies
-
     def _copies(self, fact: Fact) -> tuple[set[str], set[str]]:
         """The hosts that have the fact in memory, and on disk."""
         memory = {host for host, keeper in self._keepers.items() if fact.known_by(keeper.records.get(fact.booking))}
@@ -219,10 +215,8 @@ class BookingPromises:
         book = self.lives[fact.booking].book
         return last_end(_as_record(book)) + KEEP < self._latest + 1
 
-    # Checks at any time
-
     def look(self, leaders: Mapping[str, Rcm], *, calm: bool) -> Iterator[tuple[tuple[object, ...], float]]:
-        """Yield conditions that must not last, with their longest times. `leaders`: by host, of processes that are not
+        """Yield conditions that must not last, with their longest times. `leaders`: of processes that are not
         stopped."""
         for host, keeper in self._keepers.items():
             self._look_at_records(host, keeper)
@@ -382,8 +376,8 @@ class BookingPromises:
                     self._broken(f"{arc.name} begins a hold that overlaps the date of {booked}: {name}")
 
     def _has_no_excuse(self, rcm: Rcm, name: str, booking: Booking, arc: ArcId, now: Ns) -> bool:
-        """Return True if a booking whose date has come should be held now, and is not: no holder has higher priority,
-        or has held since before the leader knew of the booking and all its RCs."""
+        """Return True if a booking should be held by now and is not: no holder has higher priority, or has held since
+        before the leader knew of the booking and all its RCs."""
         status = rcm.core.arc(arc)
         if status is None or status.hold is not None:
             return False
@@ -405,8 +399,6 @@ class BookingPromises:
                     return False
         return True
 
-    # Checks at the end
-
     def unsettled(self, leaders: Mapping[str, Rcm]) -> str:
         """Why not all keepers know the same bookings; empty if they do."""
         if len(leaders) != 1:
@@ -416,8 +408,8 @@ class BookingPromises:
         return f"{', '.join(others)} know other bookings than the leader" if others else ""
 
     def at_end(self, leaders: Mapping[str, Rcm], *, jumped: bool) -> Counter[str]:
-        """Check the end: no fault is left, and `unsettled` is empty. `jumped`: all processes were gone at once, and
-        fleet time with them. Return counts of dates and facts by state."""
+        """Check the end: no fault is left, and `unsettled` is empty. `jumped`: all processes, and fleet time with them,
+        were gone at once. Return counts of dates and facts by state."""
         ((host, rcm),) = leaders.items()
         time = self._inside(host, lambda: rcm.bookings.dates.time)
         views = {view.id: view for view in self._inside(host, lambda: rcm.bookings.handler.views())}
@@ -469,8 +461,6 @@ class BookingPromises:
 
 
 class _FleetTime(NamedTuple):
-    """A leader's fleet time."""
-
     at: float
     """When it was read, in virtual time."""
     ahead: float
@@ -497,8 +487,6 @@ class _FleetTime(NamedTuple):
 
 
 class _Listed(NamedTuple):
-    """A date, as the leader lists it."""
-
     rank: tuple[int, Grant, str]
     date: BookedDate
     rcs: set[str]

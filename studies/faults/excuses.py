@@ -41,8 +41,8 @@ class Excuses:
     """By ended fault: hosts whose leaders led before its beginning and at its end."""
 
     def felt(self, since: float, *whom: str) -> bool:
-        """Return True if a present or recent fault may affect these processes and RCs. `since`: beginning of the hold:
-        while hosts were apart, it may be a grant of a leader that does not see all its RCs yet."""
+        """Return True if a present or recent fault may affect these processes and RCs. `since`: of the hold, which may
+        be a grant of a leader that, while hosts were apart, does not see all its RCs yet."""
         names = {*whom, *(self.where[rc] for rc in whom if rc in self.where)}
         hosts = {name.split("/")[0] for name in names} & {*self.hosts}
         now = self.now() - START

@@ -51,7 +51,6 @@ def closed(fleet: Fleet, hosts: Iterable[str], candidates: Iterable[str]) -> Fle
 
 
 async def forge(mesh: Mesh, devices: Mapping[str, object], over: Callable[[], bool]) -> None:
-    """Answer with forged requests, holds and records, until the run is over."""
     rng, me, others, instance = RANDOM.get(), mesh.me, list[WaitView](), new_instance()
 
     def lists(query: IncomingQuery[RcAsk]) -> None:

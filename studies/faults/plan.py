@@ -97,8 +97,8 @@ class Fault:
 
     @property
     def felt(self) -> float:
-        """Seconds for which its effects last after its end: until links are restored, or until every process in a
-        contradiction has reopened its session."""
+        """Seconds for which its effects last: until links are restored, or all processes in a contradiction have
+        reopened."""
         tokens_lost = self.kind == "disturb" and self.message == "alive" and self.how.lost > 0
         return HEALED if self.kind == "forget" or tokens_lost else RELINK
 
@@ -183,8 +183,8 @@ def draw_moves(seed: int, processes: Sequence[str], *, count: int, span: float) 
 
 
 def draw_for_bookings(seed: int, hosts: Sequence[str], span: float, drawn: Sequence[Fault]) -> list[Fault]:
-    """The `drawn` faults, and those most dangerous for bookings: halves that both run for some time, and faults of
-    disks and clocks."""
+    """The `drawn` faults, and those worst for bookings: halves that both run for a while, faults of disks and
+    clocks."""
     rng = random.Random(f"bookings {seed}")  # noqa: S311
     # No old answers on this key: they don't name their question, so they may concern any booking.
     faults = [
@@ -211,8 +211,8 @@ def draw_for_bookings(seed: int, hosts: Sequence[str], span: float, drawn: Seque
 
 
 def draw_lies(seed: int, hosts: Sequence[str], span: float, drawn: Sequence[Fault]) -> list[Fault]:
-    """The `drawn` faults with lies of members instead of a stranger's forgeries, and sometimes the killing of all nodes
-    while clients live."""
+    """The `drawn` faults with lies of members instead of forgeries, and sometimes all nodes killed while clients
+    live."""
     rng = random.Random(f"lies {seed}")  # noqa: S311
     faults = [fault for fault in drawn if fault.kind != "forge"]
     for kind in ("client", "rc", *rng.choices(LIES, k=2)):
@@ -230,7 +230,6 @@ def _nodes(processes: Sequence[str]) -> tuple[str, ...]:
 
 
 def _when(rng: random.Random, span: float) -> tuple[float, float]:
-    """A fault's beginning and duration."""
     at = 3.0 + rng.random() * (span - 3.0)
     return at, rng.uniform(*rng.choices(LASTING, SHARES)[0])
 

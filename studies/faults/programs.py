@@ -28,8 +28,8 @@ CLEARS_UP: Final = (0.0, 0.0, 0.2, 1.0, 60.0)
 
 
 class Program:
-    """A program that uses devices past their RCs, and its guardian, which keeps the deadline. It is a process of its
-    own, and neither stops nor dies with its client."""
+    """Uses devices past their RCs; with its guardian, which keeps the deadline. A process of its own: it neither stops
+    nor dies with its client."""
 
     def __init__(self, devices: Mapping[str, Device], direct: DirectHold, client: str, now: Callable[[], int]) -> None:
         self._devices = [devices[rc] for rc in direct.rcs]
@@ -49,7 +49,6 @@ class Program:
         self._timer = Context().run(asyncio.get_running_loop().call_later, left, self.end)
 
     def end(self) -> None:
-        """End the program: it leaves all devices."""
         if self._timer is not None:
             self._timer.cancel()
         for device in self._devices:

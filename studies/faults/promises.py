@@ -52,7 +52,6 @@ Rank: TypeAlias = tuple[int, Ns, Place]
 
 class Promises:
     """Receives the events of a run, and calls `broken(text)` for each broken promise. Times are virtual seconds.
-
     `strict`: the strategy grants in rank order. `thief`: the client that asks at the places of others."""
 
     def __init__(
@@ -181,8 +180,8 @@ class Promises:
         self._places = {key: place for key, place in self._places.items() if key[0] != name}
 
     def notified(self, name: str, arc: OpenArc, term: Term, *, touched: bool) -> None:
-        """A client, which believes no term below `term`, has news of a request. `touched`: a fault may affect the
-        client or the RCs of the request."""
+        """A client, which believes no lower term, has news of a request. `touched`: a fault may affect it or the
+        RCs."""
         full = f"{name}/{arc.id}"
         known = self._newest.get(full, arc._last)
         if known[0] > term:
@@ -262,9 +261,9 @@ class Promises:
         calm: bool,
         lasting: Mapping[tuple[object, ...], float],
     ) -> None:
-        """Check the conditions that hold at any time, for processes that are not stopped. `silence`: time since each
-        running RC last received a publication, by its own clock. `calm`: there is no fault now. `lasting`: further
-        conditions that must not last, with their longest times."""
+        """Check the conditions that hold at any time, for processes that are not stopped. `silence`: since each running
+        RC last received a publication, by its clock. `calm`: there is no fault now. `lasting`: further conditions that
+        must not last, with their longest times."""
         for rcm in leaders.values():
             if self.terms.setdefault(rcm.term, self._now()) == self._now() and not self.unheard:
                 self._begun.append(self._now())
@@ -286,8 +285,7 @@ class Promises:
                 self._broken(f"for more than {longest:g} s: {' '.join(map(str, key))}")
 
     def check_reverted_clients(self, clients: Mapping[str, Client], silence: Mapping[str, Ns]) -> None:
-        """A client may return to a lower term only from a term that it only promised, or after a hold lease of
-        `silence`."""
+        """A client returns to a lower term only from one that it only promised, or after a hold lease of `silence`."""
         for name, client in clients.items():
             term, before = client.internals.term, self._believed.get(name, NO_TERM)
             self._believed[name] = client.internals.rcm._received_term
@@ -341,8 +339,8 @@ class Promises:
         faults: Sequence[tuple[float, float]],
         excused: Collection[str] = (),
     ) -> None:
-        """Check the end: everything was served, and `LEFT_OVER` has passed. `faults`: beginning and end of each;
-        `excused`: clients that may still wait."""
+        """Everything was served, and `LEFT_OVER` has passed. `faults`: beginning and end of each; `excused`: clients
+        that may still wait."""
         for at in self._begun:
             terms = sum(at <= other < at + TERMS_WITHIN for other in self._begun)
             felt = sum(begin < at + TERMS_WITHIN and end > at for begin, end in faults)
@@ -359,7 +357,6 @@ class Promises:
 
 
 def _written(grant: Grant) -> str:
-    """The grant as written in a trace."""
     return str([[*grant.term], grant.seq])
 
 

@@ -34,7 +34,6 @@ class FaultRun:
 
 
 def run(seed: int, guard: str | None = None) -> FaultRun:
-    """Run a seed, without this `guard` of the protocol if given."""
     began = time.process_time()
     with without(guard):
         result = simulate(seed)

@@ -394,15 +394,12 @@ class Simulation:
         restarted = any(fault.kind == "restart" for fault in self.faults)
         self.result.counts += self.booked.at_end(self._leading_hosts(), jumped=restarted)
 
-    # Observation
-
     def log(self, text: str) -> None:
         process = PROCESS.get()
         who = "" if process is None else process.name
         self.result.lines.append(f"{self.loop.now - START:8.3f}  {who:8}  {text}")
 
     def broken(self, text: str) -> None:
-        """A promise was broken."""
         process = PROCESS.get()
         if process is not None and process.dead:
             return
@@ -461,8 +458,6 @@ class Simulation:
 
     def _leading_hosts(self) -> dict[str, Rcm]:
         return {name.split("/")[0]: rcm for name, rcm in self._leaders().items()}
-
-    # Processes
 
     def start(self, name: str) -> None:
         process, mesh = self.open_process(name)
@@ -565,7 +560,6 @@ class Simulation:
         return rc
 
     async def _offer_all(self, mesh: MemoryMesh, stall: StallWatch) -> None:
-        """The RCs of this process."""
         confirmations = ConfirmServer(mesh)
         for rc in [rc for rc, at in self.where.items() if at == str(mesh.me)]:
             await self._offer(rc, self.devices[rc], mesh, stall, confirmations)
@@ -584,7 +578,7 @@ class Simulation:
         return max((term.counter for term in self.promises.terms), default=0)
 
     async def _forge(self, mesh: MemoryMesh, jump: int) -> None:
-        """Publish as an RCM without a token."""
+        """Without a token."""
         term = Term(min(self._highest() + jump, MAX_COUNTER), new_instance())
         while True:
             mesh.put(mesh.keys.grants, Grants(term, 1, 1, FORGED_EVERY, {}, []))
@@ -642,7 +636,6 @@ class Simulation:
         await asyncio.gather(*(self.work.run(client, f"{mesh.me.client}-{number}", busy) for number in range(2)))
 
     def watch(self, name: str, client: Client) -> None:
-        """Check all news of this client against the promises."""
         began: dict[str, tuple[Grant | None, float, list[str]]] = {}
         """By ARC: its last grant, when it became known here, and its RCs."""
 
@@ -662,8 +655,6 @@ class Simulation:
                 began[arc.id] = arc.grant, self.loop.now - START, arc.rcs
 
         client.internals.watch(on_news)
-
-    # Faults
 
     def _begin(self, fault: Fault) -> None:
         self.log(f"FAULT {fault}")

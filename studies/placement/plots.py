@@ -26,9 +26,7 @@ Points: TypeAlias = list[tuple[Ns, float]]
 
 
 def record(path: Path, report: PlacementReport, outcomes: Outcomes) -> None:
-    """Write the recording, and replace an existing file. `outcomes` are by scenario and policy.
-
-    Raises BadInput if the file can't be written."""
+    """Replaces an existing file. `outcomes` are by scenario and policy. Raises BadInput if it can't be written."""
     import rerun as rr
 
     with recording(path, APPLICATION, _blueprint(outcomes), _words(report)) as stream:
@@ -44,8 +42,8 @@ def record(path: Path, report: PlacementReport, outcomes: Outcomes) -> None:
 
 
 def _marks(outcome: PlacementOutcome, apart: float) -> dict[str, Points]:
-    """Marks by host: one above its curve for each component, at the moment of its placement. Marks of the same moment
-    are stacked `apart` in load average, in the order of placement, so that all can be counted."""
+    """Marks by host: above its curve, for each component, when it was placed. Marks of one moment are stacked `apart`
+    in load average, in the order of placement, so that all can be counted."""
     marks: dict[str, Points] = {host: [] for host in outcome.curves}
     taken: dict[Ns, list[float]] = {}
     for component, host in outcome.placed.items():

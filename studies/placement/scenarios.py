@@ -69,11 +69,10 @@ FLEETS: Final = ("processor_speed", "load_average", "available_memory")
 
 
 def deciding_fleet(decides: str, seed: int) -> tuple[list[Machine], list[SimulatedJob]]:
-    """Eight machines that differ in load and memory, and 60 jobs that start within ten minutes.
-
-    `decides` is in `FLEETS`. Speed decides if speeds differ, processors and memory are plentiful, and the load average
-    misleads because it counts processes that wait for a disk. Load decides if speeds are equal and processors few.
-    Memory decides if jobs depend on cached files, which no profile shows, and everything else is plentiful."""
+    """Eight machines that differ in load and memory, and 60 jobs that start within ten minutes. `decides` is in
+    `FLEETS`. Speed decides if speeds differ, processors and memory are plentiful, and the load average misleads because
+    it counts processes that wait for a disk. Load decides if speeds are equal and processors few. Memory decides if
+    jobs depend on cached files, which no profile shows, and everything else is plentiful."""
     rng = Random(seed)  # noqa: S311 - a simulation
     speed, load, memory = (decides == figure for figure in FLEETS)
     machines = [

@@ -28,8 +28,8 @@ LONGEST: Final[Ns] = 24 * 3600 * SECOND
 
 @dataclass(frozen=True, slots=True)
 class Machine:
-    """A host: `memory` in bytes; `others` is other load, in cores; `blocked` processes wait for a disk: they count in
-    the load average, as on Linux, and use no processor."""
+    """`memory` in bytes; `others`: other load, in cores; `blocked` processes wait for a disk: they count in the load
+    average, as on Linux, and use no processor."""
 
     name: HostName
     cores: float = 1.0
@@ -42,11 +42,9 @@ class Machine:
 @dataclass(frozen=True, slots=True)
 class SimulatedJob:
     """A component that starts at `at` ns and needs `memory` bytes. It reads `cache` bytes of files repeatedly; they are
-    not its own memory, but it is slow where they do not fit into the file cache.
-
-    It works at a constant pace and wants `cpu` cores of speed 1.0, so fewer on a faster machine. If `greedy`, it
-    computes all the time in `cpu` threads, and does more on a faster machine. It ends after `work` core-seconds at
-    speed 1.0; None: never."""
+    not its own memory, but it is slow where they do not fit into the file cache. It works at a constant pace and wants
+    `cpu` cores of speed 1.0, so fewer on a faster machine. If `greedy`, it computes all the time in `cpu` threads, and
+    does more on a faster machine. It ends after `work` core-seconds at speed 1.0; None: never."""
 
     component: ComponentId
     kind: Kind
@@ -58,7 +56,6 @@ class SimulatedJob:
     cache: int = 0
 
     def wants(self, speed: float) -> float:
-        """Cores that it wants on a machine of this speed."""
         return self.cpu if self.greedy else self.cpu / speed
 
 
@@ -160,9 +157,8 @@ def simulate(
     balancer: Balancer | None = None,
 ) -> PlacementOutcome:
     """Start the jobs at their times, each on the host that the balancer ranks first, and run until `until`, or until
-    the last has ended. `balancer` may have learnt in an earlier run; it has no reports yet.
-
-    Raises ValueError if the run would never end, or has not ended after a day."""
+    the last has ended. `balancer` may have learnt in an earlier run; it has no reports yet. Raises ValueError if the
+    run would never end, or has not ended after a day."""
     if until is None and any(job.work is None for job in jobs):
         raise ValueError("a job without an end needs `until`")
     rng = Random(seed)  # noqa: S311 - a simulation

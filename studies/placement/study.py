@@ -34,11 +34,10 @@ LATEST: Final = 20
 
 @dataclass(frozen=True, slots=True)
 class PolicySpread:
-    """Three Place Sensor Nets on three workstations under one policy, over all seeds.
-
-    `splits`: number of seeds by split of the components, the fullest host first. `used_all`: seeds in which every host
-    got components. `even`: seeds in which the hosts' counts differed by at most 1. `apart`: highest minus lowest load
-    average, mean over time and seeds."""
+    """Three Place Sensor Nets on three workstations under one policy, over all seeds. `splits`: number of seeds by
+    split of the components, the fullest host first. `used_all`: seeds in which every host got components. `even`: seeds
+    in which the hosts' counts differed by at most 1. `apart`: highest minus lowest load average, mean over time and
+    seeds."""
 
     scenario: str
     policy: Policy
@@ -50,8 +49,8 @@ class PolicySpread:
 
 @dataclass(frozen=True, slots=True)
 class Batch:
-    """The mixed batch on unlike machines: means over seeds, in seconds. `makespan`: until the last end; `completion`:
-    from a component's start to its end. The gains are relative to `BASELINE`, at most 1."""
+    """Means over seeds, in seconds. `makespan`: until the last end; `completion`: from a component's start to its end.
+    The gains are relative to `BASELINE`, at most 1."""
 
     metric: Metric
     policy: Policy
@@ -63,8 +62,8 @@ class Batch:
 
 @dataclass(frozen=True, slots=True)
 class Learnt:
-    """The choice of metric `auto` in a fleet where the figure `decides`. `used`: number of seeds by the metric of most
-    of the last placements. `why`: its explanation at the end of the first seed."""
+    """What `auto` chose in a fleet where the figure `decides`. `used`: seeds by the metric of most of the last
+    placements. `why`: its explanation at the end of the first seed."""
 
     decides: str
     used: Mapping[Metric, int]

@@ -47,7 +47,6 @@ class CrossingsOf:
         return self.fates["in time"] / self.all if self.all else math.nan
 
     def add(self, other: CrossingsOf) -> None:
-        """Add the counts of `other`."""
         self.fates += other.fates
         self.could += other.could
         self.told += other.told
@@ -55,7 +54,7 @@ class CrossingsOf:
 
 @dataclass(slots=True)
 class _Place:
-    """The last place where a robot reported to be hidden, and the present crossing of its view from there."""
+    """Where a robot last reported to be hidden, and the present crossing of its view from there."""
 
     pose: Pose
     obstacle: Fate | None = None
@@ -88,8 +87,7 @@ class Crossings:
             self._places[robot] = _Place(pose)
 
     def looked(self, robot: str, *, watches: bool, picture: bool, learning: bool, alert: bool) -> None:
-        """A look of a held robot: whether it `watches`, had a good `picture`, is `learning` its background, and gives
-        an `alert`."""
+        """A held robot's look: it `watches`, had a good `picture`, is `learning` its background, gives an `alert`."""
         if not watches:
             self._doing[robot] = "not hidden"
         elif not picture:

@@ -107,8 +107,6 @@ def crewed(plan: Plan, robots: int, *, seed: int = 0) -> Plan:
 
 
 class Player:
-    """One robot's side of the queue."""
-
     def __init__(self, name: str, seed: int) -> None:
         self.name, self.scout = name, Scout(seed=seed)
         self.asked: ArcId | None = None
@@ -140,7 +138,6 @@ class Player:
 
 
 def _channel(hold: Granted) -> int:
-    """The number of the hold's video channel."""
     return next(int(rc.removeprefix("video/ch")) for rc in hold.rcs if rc.startswith("video/"))
 
 
@@ -205,7 +202,6 @@ class FieldRun:
         return min(times)
 
     def _play(self) -> None:
-        """Play all due events."""
         now = self.world.time
         while self._under_way and self._under_way[0][0] <= now + _SOON:
             heapq.heappop(self._under_way)[2]()
@@ -220,8 +216,6 @@ class FieldRun:
             if player.held is not None and player.next_picture <= now + _SOON:
                 player.next_picture += 1 / self.field.frame_rate
                 self._look(player)
-
-    # The queue
 
     def _ask(self, player: Player) -> None:
         player.turns += 1
@@ -255,7 +249,7 @@ class FieldRun:
 
     def _schedule_warm_ups(self) -> list[Event]:
         """Set when cameras start to warm up, by a forecast of turns as in `place_robot`. Return the ends of warm-ups
-        whose turns have moved away again."""
+        whose turns have moved away."""
         now = self.world.time
         waiting = [
             player
@@ -325,7 +319,6 @@ class FieldRun:
         return Vote(asked.proposal, accept=not reason, reason=reason)
 
     def _heed(self, effect: Effect) -> None:
-        """Carry out a grant or its end."""
         now = self.world.time
         match effect:
             case Granted(arc=arc):
@@ -357,8 +350,6 @@ class FieldRun:
                     player.asks_at = now
             case _:
                 pass
-
-    # The robot
 
     def _look(self, player: Player) -> None:
         picture = self._air.receive(self.world, player.channel)

@@ -84,8 +84,8 @@ def trial(
     limit: float = LIMIT,
     watch: Watch | None = None,
 ) -> HideOutcome:
-    """Run the plan's first robot from `start`; the others stay at their places in the plan. Ends when the controller
-    reports that it is hidden, or `limit` seconds after the first picture."""
+    """Run the plan's first robot from `start`; the others stay. Ends when the controller reports that it is hidden, or
+    `limit` seconds after the first picture."""
     link = link or LinkConditions()
     robot = plan.robots[0]
     world = World(plan, seed=seed, starts={robot.name: start})
@@ -160,6 +160,5 @@ class HideJob:
 
 
 def run(job: HideJob) -> HideOutcome:
-    """Run a job."""
     start = World(job.plan, seed=job.seed).random_start(np.random.default_rng(job.seed))
     return trial(job.plan, start, job.seed, link=job.link)

@@ -58,8 +58,6 @@ class RobotsJob:
 
 @dataclass(frozen=True, slots=True)
 class RobotsTrial:
-    """A job and its outcome."""
-
     job: RobotsJob
     outcomes: Outcomes | hide.HideOutcome
 
@@ -71,8 +69,7 @@ def buildings() -> list[str]:
 
 @lru_cache(maxsize=8)
 def plan_of(building: str, seed: int) -> Plan:
-    """A building by its name, or from its file. Raises BadInput if it does not exist, ValueError if none can be
-    drawn."""
+    """By name, or from its file. Raises BadInput if it does not exist, ValueError if none can be drawn."""
     if building == DRAWN:
         return drawn_plan(seed)
     shipped = shipped_plans()
@@ -102,8 +99,7 @@ def run(job: RobotsJob) -> RobotsTrial:
 
 
 def grid(robots: Iterable[int], channels: Iterable[int], baud: int = ENOUGH_BAUD) -> list[Field]:
-    """All pairs of numbers of robots and channels. More channels than robots change nothing: they are left out, unless
-    no pair would remain."""
+    """All pairs. More channels than robots change nothing: they are left out, unless no pair would remain."""
     channels = sorted(set(channels))
     fields = []
     for count in sorted(set(robots)):

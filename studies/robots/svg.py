@@ -69,7 +69,6 @@ def write(folder: Path, grid: Sequence[FieldFigures], radio: Sequence[FieldFigur
 
 
 def svg(plot: Plot) -> str:
-    """The picture as text."""
     ticks = list(dict.fromkeys(name for line in plot.lines.values() for name, _ in line))
     ticks.sort(key=int)
     finite = [

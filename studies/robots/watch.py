@@ -54,7 +54,6 @@ class Watched:
     pictures: int = 0
 
     def add(self, other: Watched) -> None:
-        """Add the counts of `other`."""
         self.crossings += other.crossings
         self.alerted += other.alerted
         self.late += other.late
@@ -65,8 +64,8 @@ class Watched:
 
 
 def watch(plan: Plan, *, seed: int, noise: float, seconds: float, rate: float = 5.0) -> Watched:
-    """Watch from a dark place of `plan` that faces the light, with `rate` pictures a second and `noise` times the usual
-    noise of camera and air."""
+    """Watch from a dark place that faces the light, with `rate` pictures a second and `noise` times the usual noise of
+    camera and air."""
     spoiled = msgspec.structs.replace(plan.noise, sensor=noise, analog=noise)
     world = World(msgspec.structs.replace(plan, noise=spoiled), seed=seed)
     air, detector, out = Air(seed=seed), MotionDetector(), Watched()
@@ -105,8 +104,7 @@ def watch(plan: Plan, *, seed: int, noise: float, seconds: float, rate: float = 
 
 
 def hide_at_random(world: World, rng: np.random.Generator) -> str:
-    """Put the first robot into a dark place, facing the light, and return its name. Raises ValueError if there is no
-    such place."""
+    """Put the first robot into a dark place, facing the light; return its name. Raises ValueError if there is none."""
     name = next(iter(world.bodies))
     truth = world.truth
     dark = np.argwhere(truth.dark)
@@ -121,8 +119,6 @@ def hide_at_random(world: World, rng: np.random.Generator) -> str:
 
 
 class Case(NamedTuple):
-    """A single watch of `cases`."""
-
     building: str
     """The name of a shipped plan, or DRAWN."""
     noise: float

@@ -20,8 +20,8 @@ ALL: Final = (1 << DEVICES) - 1
 Running: TypeAlias = list[tuple[Ns, int]]
 """A heap of ends and bits of devices."""
 Pick: TypeAlias = Callable[[Ns, list[int], int, Running], Iterator[tuple[int, int]]]
-"""Picks the jobs that start at an instant, from a queue in order of arrival. Yields their numbers and devices. A job
-has left the queue when the next is picked."""
+"""Picks the jobs that start now from a queue in order of arrival; yields numbers and devices. A picked job has left the
+queue."""
 
 
 def easy(jobs: Sequence[Job]) -> list[Ns]:

@@ -31,8 +31,8 @@ WEIGHT: Final = 100
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class ClairvoyantTrial:
-    """`least`: the plan's weighted sum of waits in seconds; `proven`: it is the optimum. By strategy: `waits`, the
-    weighted sum of waits, and `ends`, when the last hold ended."""
+    """`least`: the plan's weighted sum of waits in seconds; `proven`: it is the optimum. By strategy: `waits`, the same
+    sum, and `ends`, when the last hold ended."""
 
     seed: int
     least: int
@@ -57,7 +57,7 @@ def case(seed: int, levels: int) -> Workload:
 
 def least(work: Workload, seconds: float) -> tuple[int, bool]:
     """The least weighted sum of waits found within `seconds`, and whether it is proven to be optimal."""
-    from ortools.sat.python import cp_model  # large, so imported on use
+    from ortools.sat.python import cp_model
 
     model, intervals, waits = cp_model.CpModel(), dict[str, list[cp_model.IntervalVar]](), []
     known = [

@@ -46,8 +46,7 @@ class ForecastJob:
 
 @dataclass(frozen=True, slots=True)
 class ForetoldStart:
-    """The forecast and true waits of an ARC from when it was first queued, in ns. None: a forecast that it never
-    starts."""
+    """Forecast and true waits from when an ARC was first queued, in ns. None: it never starts."""
 
     waits: tuple[Ns | None, ...]
     """In the order of `WAYS`."""
@@ -85,8 +84,7 @@ class _TrueRuntimes(RuntimeEstimator):
 
 
 def overestimated(workload: Workload, random: Random, *, exact: bool = False) -> tuple[Workload, Mapping[ArcId, Ns]]:
-    """Return the workload as runs of programs that ask for too much time, unless `exact`; and the ns that each ARC
-    takes."""
+    """The workload as runs of programs that ask for too much time, unless `exact`; and the ns that each ARC takes."""
     factors = [random.uniform(*FACTORS) for _ in range(PROGRAMS)]
     arrivals = []
     for arrival in workload.arrivals:

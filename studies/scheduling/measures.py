@@ -15,10 +15,8 @@ from zscout.types import ArcId, Ns, RcName
 
 @dataclass(frozen=True, slots=True)
 class Measures:
-    """One run. Times in ns, shares from 0 to 1.
-
-    An ARC's wait lasts from its request to the start of the hold that it completes, because work in a hold that was
-    taken away must be done again."""
+    """One run. Times in ns, shares from 0 to 1. An ARC's wait lasts until the start of the hold that it completes,
+    because work in a hold that was taken away must be done again."""
 
     in_use: float
     """Mean share of held RCs until the last request, or until the last end if all ask at once."""

@@ -25,9 +25,7 @@ BARS: Final = (
 
 
 def record(path: Path, report: SchedulingReport, curves: Mapping[tuple[str, str], Curve]) -> None:
-    """Write the recording, and replace an existing file. `curves` are by family and strategy.
-
-    Raises BadInput if the file can't be written."""
+    """Replaces an existing file. `curves` are by family and strategy. Raises BadInput if the file can't be written."""
     import rerun as rr
 
     with recording(path, APPLICATION, _blueprint(report, curves), _words(report)) as stream:

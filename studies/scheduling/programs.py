@@ -17,8 +17,8 @@ from zscout.types import SECOND, ArcId, Ns, Params, RcName
 
 
 class ProgramJob(NamedTuple):
-    """An ARC of a program: requested `pause` ns after the end of the previous ARC, for `asked` ns. After `used` ns its
-    work is done; if that is less, it is released early."""
+    """Requested `pause` ns after the end of the previous ARC, for `asked` ns; done after `used` ns, if less: released
+    early."""
 
     pause: Ns
     rcs: tuple[RcName, ...]
@@ -108,8 +108,8 @@ class _Run:
 def play(
     rcs: Sequence[RcName], groups: Mapping[str, Sequence[Iterator[ProgramJob]]], policy: SchedulingPolicy, until: Ns
 ) -> dict[str, Use]:
-    """Return the use of each group until `until`. Strategy `adaptive`, exclusive RCs, a single priority. A group is
-    named like its host."""
+    """Each group's use until `until`. Strategy `adaptive`, exclusive RCs, a single priority. Groups are named like
+    hosts."""
     run = _Run(Core(Adaptive(), policy), uses={group: Use() for group in groups})
     for group, programs in groups.items():
         for number, jobs in enumerate(programs):

@@ -79,16 +79,13 @@ def _endless(random: Random, rcs: Sequence[RcName], mean: float, pause: float) -
         yield _job(random, rcs, mean, round(random.expovariate(1 / pause)) * SECOND)
 
 
-# Does a group profit from asking for other things than it needs?
-
 Programs = list[Iterator[ProgramJob]]
 Way = Callable[[Sequence[int], Callable[[int], Iterator[ProgramJob]], "SharesCase"], Programs]
 
 
 @dataclass(frozen=True, slots=True)
 class SharesCase:
-    """A fleet. `groups`: the seeds of the programs by group. `factor`: of inflated requests, or the number of pieces of
-    split ones."""
+    """`groups`: the seeds of the programs by group. `factor`: of inflated requests, or pieces of split ones."""
 
     seed: int
     rcs: tuple[RcName, ...]
@@ -169,8 +166,7 @@ WAYS: Final[Mapping[str, Way]] = {
 
 @dataclass(frozen=True, slots=True)
 class CaseTrial:
-    """The gamer's part of all useful RC-seconds, if it asks `honest` and if it does not, with fair shares and without
-    (`off`)."""
+    """The gamer's part of useful RC-seconds, if it asks `honest` and if not, with fair shares and without (`off`)."""
 
     case: SharesCase
     honest: float
@@ -199,9 +195,6 @@ def _part(case: SharesCase, way: Way, policy: SchedulingPolicy) -> float:
     uses = play(case.rcs, groups, policy, HOUR)
     total = sum(use.useful for use in uses.values())
     return uses[GAMER].useful / total if total else 0.0
-
-
-# Results
 
 
 @dataclass(frozen=True, slots=True)

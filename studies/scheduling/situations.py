@@ -78,9 +78,7 @@ class _Before:
 
 
 class Observer:
-    """Observes the state before and after each pass, and compares every situation with the best.
-
-    Call `before` and `after` around each pass, and `close` at the end."""
+    """Compares every situation with the best. Call `before` and `after` around each pass, and `close` at the end."""
 
     def __init__(self, rcs: Sequence[WorkloadRc], best: Strategy) -> None:
         self.rcs = rcs

@@ -57,9 +57,8 @@ class StrategyReport:
 
 @dataclass(frozen=True, slots=True)
 class Degeneracy:
-    """How often the heuristic is behind the best set in the same situation, and how far.
-
-    Ratios: pairs in use divided by pairs in the best set; `first` ratios are from each run's first situation."""
+    """How often the heuristic is behind the best set in the same situation, and how far. Ratios: pairs in use divided
+    by pairs in the best set; `first` ratios are from each run's first situation."""
 
     situations: int
     behind: int

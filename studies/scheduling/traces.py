@@ -34,8 +34,8 @@ class TraceTrial(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class TraceReport:
-    """Waits in seconds. `higher`: mean wait of the higher class; `thrown_away`: as a share of the held device time;
-    `event_us`: processor time per event of the core, in microseconds."""
+    """Waits in seconds. `higher`: mean wait of the higher class; `thrown_away`: share of held device time; `event_us`:
+    processor time per event of the core."""
 
     policy: str
     classes: bool

@@ -68,15 +68,13 @@ class _Watched:
 
 
 def run(job: SchedulingJob, clock: Callable[[], Ns]) -> SchedulingTrial:
-    """Run a job to its end. `clock` gives ns, and only times the passes.
-
-    Raises KeyError for an unknown family or strategy."""
+    """`clock` gives ns, and only times the passes. Raises KeyError for an unknown family or strategy."""
     return play(job, FAMILIES[job.family].workload(job.seed), clock)
 
 
 def run_timed(job: SchedulingJob) -> SchedulingTrial:
-    """The same with passes timed in processor time, because a study keeps all processors busy; of all threads, because
-    a solver may have several."""
+    """Passes are timed in processor time, as a study keeps all processors busy; of all threads, as a solver may have
+    several."""
     return run(job, time.process_time_ns)
 
 
