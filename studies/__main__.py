@@ -35,6 +35,7 @@ STUDIES: Final[dict[str, Study]] = {
     "robots": Study("robots.commands:robots", "How soon are robots hidden, and what do they then see?", "30 min"),
     "watching": Study("watching:main", "How many passers-by does the motion detector report?", "20 min"),
     "cdnet": Study("cdnet:main", "How does the motion detector compare with MOG2 and KNN on CDnet 2014?", "1 min"),
+    "detectors": Study("detectors:main", "Where does the motion detector fail, and do MOG2 and KNN?", "1 min"),
     "faults": Study("faults.commands:faults", "Are all promises kept under faults, in virtual time?", "3 min"),
     "chaos": Study("chaos.__main__:main", "Are all promises kept in a real fleet under faults?", "20 min, root"),
     "soak": Study("chaos.soak:main", "What does a fleet use after hours?", "8 h, root"),
