@@ -17,6 +17,7 @@ from zscout.behaviors.client.client import Client
 from zscout.behaviors.client.confirmation import CONFIRM_TIMEOUT
 from zscout.behaviors.client.internals import NOTICE_TIMEOUT, REJOIN_TIMEOUT
 from zscout.behaviors.client.request import CommandRefused
+from zscout.keyexpr import Role
 from zscout.messages import Command
 from zscout.scheduling.model import HOLD_BACK
 from zscout.testing.link import Disturbance
@@ -127,6 +128,24 @@ async def test_a_leader_that_is_asked_by_whom_it_does_not_see_joins_the_mesh_ane
         await asyncio.sleep(10)
         assert arc.state == "running"
         assert "client_lost" not in outcomes
+
+
+async def test_a_holder_that_does_not_see_the_leader_it_receives_soon_asks_it() -> None:
+    """Links came back without the token of the leader, and without all that this client declared but its subscription
+    of publications: the leader has ended its hold, and nothing but the answer to a request tells the client."""
+    async with small_fleet("one") as (fleet, (one,)):
+        arc, grant = await held(one, "first")
+        leader, client = transport_of(fleet.leader()), transport_of(one.mesh)
+        heard = [known for known in client.subscribers.all if known[0] == one.mesh.keys.grants]
+        fleet.network.link(one.mesh, fleet.leader()).hidden = {*client.declarations()} - {*heard}
+        fleet.network.link(fleet.leader(), one.mesh).hidden = {
+            token for token in leader.declared if fleet.leader().keys.token_of(token).role == Role.RCM
+        }
+        leader.disconnected(client)
+        client.disconnected(leader)
+        await until(lambda: one.leader is None)
+        await until(lambda: not fleet.rcs[0].holds.held, within=2.0)
+        await until(lambda: arc.grant != grant, within=1.5)
 
 
 async def test_what_was_granted_again_unheard_is_given_back_by_who_had_its_time(

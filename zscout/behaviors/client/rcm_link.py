@@ -280,14 +280,19 @@ class RcmLink:
         return reply.problem
 
     async def keep_asking(self) -> NoReturn:
-        """Repeat all requests and withdrawals at every change of the RCM and every few seconds; sooner without an
-        answer."""
+        """Repeat all requests and withdrawals at every change of the RCM and every few seconds; every second while a
+        visible RCM does not answer, or publications of an invisible RCM arrive."""
         unanswered, known = False, self._changes
         while True:
-            if self._changes == known:
+            varied = RANDOM.get().uniform(0.8, 1.2) if self._changes == known else 0.0
+            pause, step = ASK_AGAIN * varied, BACKOFF[1] * varied
+            while self._changes == known and pause > 0:
                 self.leader_came.clear()
-                pause = BACKOFF[1] if unanswered and self.leader is not None else ASK_AGAIN
-                await self.leader_within(pause * RANDOM.get().uniform(0.8, 1.2))
+                await self.leader_within(min(step, pause))
+                pause -= step
+                # A leader that publishes and is not visible may have ended a hold without notifying this client.
+                if self._in_contact if self.leader is None else unanswered:
+                    break
             unanswered, known = False, self._changes
             for arc in self.store.open:
                 if arc.open and self.store.resumed.is_set():
