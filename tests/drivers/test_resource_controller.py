@@ -35,6 +35,7 @@ from zscout.drivers.work_queue import COMMANDS_PER_HOST, EARLY_PER_HOST, WorkQue
 from zscout.keyexpr import Role, Sender
 from zscout.mesh import IncomingQuery, Mesh, Refused
 from zscout.messages import (
+    Ballot,
     Command,
     Confirm,
     Confirmed,
@@ -43,6 +44,8 @@ from zscout.messages import (
     Holder,
     Malformed,
     Problem,
+    Proposal,
+    ProposedHolder,
     RcAsk,
     RcmState,
     RcState,
@@ -80,6 +83,20 @@ async def test_the_safe_state_waits_for_no_command_though_the_rcm_hangs() -> Non
         assert rcm.mesh.now() - ended < 0.01 * SECOND
         assert await asyncio.gather(*early) == ["not_yet"] * EARLY_PER_HOST + ["busy"] * (20 - EARLY_PER_HOST)
         assert len(rcm.asked) == asked
+
+
+class Picky(Device):
+    sharable = True
+
+    def vote(self, holders: list[ProposedHolder]) -> str:
+        raise ValueError("no such parameter: pace")
+
+
+async def test_a_driver_that_can_not_read_a_proposal_votes_against_it() -> None:
+    async with play(Picky) as (_, _, _, client):
+        reply = await client.ask_one(client.keys.vote("robot/x"), Proposal(7, TERM, []), Ballot, timeout=1)
+        assert reply is not None
+        assert reply.message == Ballot(7, accept=False, reason="no such parameter: pace")
 
 
 class Carrying(Device):

@@ -136,7 +136,7 @@ class Driver:
 
     def vote(self, holders: list[ProposedHolder]) -> str:
         """Return why a sharable device can't serve these holders together, or an empty string if it can serve them
-        and any subset of them."""
+        and any subset of them. A ValueError refuses them as well."""
         return ""
 
     def parameters(self) -> list[Parameter] | None:

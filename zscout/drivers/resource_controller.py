@@ -403,7 +403,7 @@ class ResourceController:
         try:
             reason = self.driver.vote(proposal.holders)
         except ValueError as error:
-            raise Refused("bad_request", str(error)) from None
+            reason = str(error) or "the driver can't read the proposal"
         query.answer(messages.Ballot(proposal=proposal.proposal, accept=not reason, reason=reason))
 
     def _on_command(self, query: CommandQuery) -> None:

@@ -55,6 +55,8 @@ class FakeRc:
     leader: bool = False
     accept: bool | None = True
     """Its vote; None: not before it is told to `vote`."""
+    unreadable: str = ""
+    """Answer proposals with a holder of this name by an error."""
     proposals: list[Proposal] = field(default_factory=list)
     asked: list[RcAsk] = field(default_factory=list)
     rules: int = 0
@@ -113,6 +115,8 @@ class FakeRc:
 
     def _on_proposal(self, query: IncomingQuery[Proposal]) -> None:
         self.proposals.append(query.message)
+        if any(holder.arc == self.unreadable for holder in query.message.holders):
+            raise Refused("bad_request", "no such parameter: pace")
         self.unanswered.append(query)
         if self.accept is not None:
             self.vote(self.accept)

@@ -122,6 +122,16 @@ async def test_a_vote_that_is_late_grants_later_and_a_veto_is_a_reason() -> None
     await until(lambda: radio.arcs == ["talk", "more"])
 
 
+async def test_a_request_that_an_rc_can_not_read_does_not_keep_others_from_it() -> None:
+    fleet = FakeFleet()
+    fleet.rcm()
+    radio = fleet.rc("radio/f", unreadable="bad")
+    await fleet.joined(radio)
+    client = fleet.client("one")
+    assert (await client.ask("bad", "radio/f:5")).reason == "radio/f refuses: no such parameter: pace"
+    assert (await client.ask("good", "radio/f:5")).state == "running"
+
+
 async def test_an_rc_that_comes_is_granted_and_one_that_goes_ends_the_whole_gang() -> None:
     fleet = FakeFleet()
     fleet.rcm()

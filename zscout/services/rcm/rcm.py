@@ -373,6 +373,11 @@ class Rcm:
         if ballot is not None and ballot.proposal == proposal:
             self._take(steps.CoreEvents([Vote(proposal, ballot.accept, ballot.reason[:MAX_REASON])]))
             return
-        if reply is not None and reply.problem is not None:
-            log.warning("%s did not vote: %s", rc, reply.problem.message)
+        problem = reply.problem if reply is not None else None
+        if problem is not None and problem.code == "bad_request":
+            # As overdue, one request that the RC can't read would keep all others from the RC.
+            self._take(steps.CoreEvents([Vote(proposal, False, problem.message[:MAX_REASON])]))
+            return
+        if problem is not None:
+            log.warning("%s did not vote: %s", rc, problem.message)
         self._take(steps.CoreEvents([VoteOverdue(proposal)]))
