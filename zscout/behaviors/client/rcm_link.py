@@ -76,6 +76,8 @@ class RcmLink:
         self._changes = 0
         """How often a leader appeared, or one of several disappeared."""
         self._last_contact: Ns = mesh.now()
+        self._unseen_since: Ns = mesh.now()
+        """When the last visible leader disappeared."""
         self._stall = StallWatch(mesh.now)
         self._last_terms = LastTerms(mesh, supervisor, self._raise_term, timeout=QUERY_TIMEOUT)
 
@@ -186,6 +188,8 @@ class RcmLink:
 
     def _on_leader(self, token: Token, alive: bool) -> None:
         (self._leaders.add if alive else self._leaders.discard)(token)
+        if not self._leaders:
+            self._unseen_since = self.mesh.now()
         if self._leaders:
             self._changes += 1
             # Also if one of two has gone: the answer of the remaining leader may have arrived second, and be lost.
@@ -291,7 +295,7 @@ class RcmLink:
                 await self.leader_within(min(step, pause))
                 pause -= step
                 # A leader that publishes and is not visible may have ended a hold without notifying this client.
-                if self._in_contact if self.leader is None else unanswered:
+                if self._last_contact > self._unseen_since if self.leader is None else unanswered:
                     break
             unanswered, known = False, self._changes
             for arc in self.store.open:
