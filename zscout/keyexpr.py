@@ -92,8 +92,7 @@ def host_in(need: str) -> str | None:
 
 @lru_cache(CACHED_NAMES)
 def check_maintained(need: str) -> str:
-    """Return `need` if it is an RC, a pattern for all matching RCs, or `@<host>` for all RCs of a host. Raises
-    BadName."""
+    """Return an RC, a pattern for all matching RCs, or `@<host>` for all RCs of a host. Raises BadName."""
     if (host := host_in(need)) is None:
         return check_need(need)
     check_name(host, "host")

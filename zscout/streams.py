@@ -1,5 +1,4 @@
-"""Makes standard input, output and error usable: open, even if the program was started without them, and able to write
-every text."""
+"""Makes standard streams usable: open, even if the program was started without them, and able to write every text."""
 
 from __future__ import annotations
 

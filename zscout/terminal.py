@@ -1,7 +1,6 @@
 """Terminal output (lines, JSON, tables, a progress bar, live pictures), and input of single keys.
 
-Rich is imported in the functions that need it: imports take most of a short command's time.
-"""
+Rich is imported where it is needed: imports take most of a short command's time."""
 
 from __future__ import annotations
 

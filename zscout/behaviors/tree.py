@@ -138,8 +138,7 @@ class CarriedClock:
         self._read_at: Ns | None = None
 
     def read(self, at: Ns, speed: float = 1.0) -> float:
-        """Return the seconds lived until `at` on this host's clock. The time since the last reading counts times
-        `speed`."""
+        """Return the seconds lived until `at` on this host's clock; since the last reading, times `speed`."""
         if self._read_at is not None:
             self.seconds += (at - self._read_at) / SECOND * speed
         self._read_at = at

@@ -1,7 +1,6 @@
 """Shared by the subcommands: running, joining the mesh, options.
 
-Zenoh and Rich are imported by the functions that need them: most of a short command's time is imports.
-"""
+Zenoh and Rich are imported where they are needed: most of a short command's time is imports."""
 
 from __future__ import annotations
 
@@ -74,8 +73,7 @@ class Interrupted(Exception):
 
 
 def run(main: Coroutine[Any, Any, T]) -> T:
-    """SIGINT, SIGTERM and SIGHUP cancel it, so that it cleans up; a second signal cancels that. Raises Interrupted
-    after a signal."""
+    """SIGINT, SIGTERM and SIGHUP cancel it to clean up; a second one cancels that. Raises Interrupted after them."""
     signals: list[int] = []
 
     async def guarded() -> T:
@@ -192,8 +190,7 @@ async def beside(work: Coroutine[Any, Any, Any]) -> AsyncIterator[None]:
 
 
 async def first_of(*works: Coroutine[Any, Any, Any]) -> list[bool]:
-    """Run `works` until the first ends, and cancel the others. Return for each whether it had ended; raise its
-    exception."""
+    """Run until the first ends, then cancel the others. Return for each whether it had ended; raise its exception."""
     tasks = [asyncio.ensure_future(work) for work in works]
     try:
         done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)

@@ -1,7 +1,6 @@
-"""Groups of commands whose modules are imported when they are used, and the groups below `zscout`.
+"""Groups of commands, whose modules are imported on use, and the groups below `zscout`.
 
-`--help` and completion need only these tables, so neither loads Zenoh, Rich or Rerun.
-"""
+`--help` and completion need only these tables, so neither loads Zenoh, Rich or Rerun."""
 
 from __future__ import annotations
 

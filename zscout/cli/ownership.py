@@ -33,8 +33,7 @@ class User(NamedTuple):
         return cls(client.who.user if client.who is not None else "", client.mesh.me.host, closed)
 
     def owns(self, owner: str, who: Who | None) -> bool:
-        """Same user on any host; with certificates, or if the user is unknown, same `owner`: a host or certificate's
-        name."""
+        """Same user on any host; with certificates or an unknown user, same `owner`: a host or certificate's name."""
         user = who.user if who is not None else ""
         return owner == self.host if self.proved or not user else user == self.name
 

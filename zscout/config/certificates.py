@@ -157,8 +157,7 @@ def read_places_key(folder: Path) -> bytes | None:
 
 
 def read_cas(path: Path) -> list[Validity]:
-    """Raises BadInput, also for a certificate that is not a CA's: Zenoh would trust certificates signed with its
-    key."""
+    """Raises BadInput, also for one that is not a CA's: Zenoh would trust certificates signed with its key."""
     check_mode(path, 0o002, "644")
     store = _store(path)
     count = store.cert_store_stats()

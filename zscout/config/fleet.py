@@ -91,8 +91,7 @@ class MeshConfig(MeshTable, frozen=True):
 
     @property
     def known_by(self) -> tuple[str, ...]:
-        """Addresses by which all processes of a host know this mesh: of multicast, without it the fleet file's
-        endpoints."""
+        """Addresses by which a host's processes know this mesh: multicast, else the fleet file's endpoints."""
         return (
             (self.multicast_address,) if self.multicast else self.shared or tuple(sorted({*self.listen, *self.connect}))
         )

@@ -1,5 +1,4 @@
-"""Packages that an installation may lack (requirements/light.txt omits them, or an extra adds them), and how to get
-them."""
+"""Packages that an installation may lack (not in requirements/light.txt, or of an extra), and how to get them."""
 
 from __future__ import annotations
 

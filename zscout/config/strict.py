@@ -134,9 +134,9 @@ def read_toml(path: Path, type: type[T], *, max_bytes: int = 1_000_000) -> T:  #
 
 
 def parse_toml(text: str, source: str, type: type[T]) -> T:  # noqa: A002 - msgspec's word
-    """`source` names the file in errors. Raises BadInput, also for unknown keys. Numbers with a point are read exactly,
-    as Decimal. Struct fields may be Decimal, float, int, str, bool, Literal, lists and tables of these, Any, structs
-    and dataclasses."""
+    """`source` names the file in errors. Raises BadInput, also for unknown keys. Numbers with a point are exact, as
+    Decimal. Fields may be Decimal, float, int, str, bool, Literal, lists and tables of these, Any, structs,
+    dataclasses."""
     where = Where(source)
     if deep := _DEEP_KEY.search(text):
         line = text.count("\n", 0, deep.start()) + 1
@@ -232,8 +232,7 @@ def key(
     most: int | None = None,
     remedy: str = "",
 ) -> Meta:
-    """Description and bounds of a field. `most`: greatest number of entries; `remedy`: in the error if it is
-    missing."""
+    """Description and bounds of a field. `most`: entries at most; `remedy`: in the error if it is missing."""
     extra = {name: text for name, text in (("unit", unit), ("remedy", remedy)) if text}
     bounds: dict[str, Any] = {"ge": low, "le": high, "max_length": most}
     examples = None if example is None else [example]

@@ -70,7 +70,7 @@ def default_rate(rate: Fraction) -> Fraction:
 
 
 def share_of(params: Mapping[str, Decimal], default: Fraction = DEFAULT_RATE) -> Share:
-    """The share in bandwidth parameters; `default`: the rate if they have none. Raises ValueError with a reason for
+    """The share in bandwidth parameters; `default`: the rate without any. Raises ValueError with a reason for
     people."""
     amounts = exact_amounts(params)
     rate = amounts.get("command_rate", default)

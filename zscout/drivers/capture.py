@@ -125,8 +125,7 @@ class Capture:
         return self._thread.is_alive()
 
     def wait(self, after: int, timeout: float) -> CapturedFrame | None:
-        """Return the newest picture, numbered above `after`; None if none came in `timeout` seconds, or once
-        stopped."""
+        """Return the newest picture, numbered above `after`; None after `timeout` seconds, or once stopped."""
         with self._new_picture:
             self._new_picture.wait_for(lambda: self.number > after or self._stop.is_set(), timeout)
             if self._stop.is_set() or self.number <= after:
@@ -265,8 +264,7 @@ def _stop_all() -> None:
 
 
 class _Transport:
-    """OpenCV reads RTSP's transport from the environment when it opens a source: sources with different transports are
-    opened in turn."""
+    """OpenCV reads RTSP's transport from the environment on opening: sources with different ones open in turn."""
 
     def __init__(self) -> None:
         self._turn = threading.Lock()

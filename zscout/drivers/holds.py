@@ -357,8 +357,7 @@ class HoldTable:
             self.held[grant].gone_by = None
 
     def check(self, grant: Grant, client: str, now: Ns) -> Problem | None:
-        """Return why a command of `client` under `grant` is refused now, with a code of the protocol; None: it is
-        obeyed."""
+        """Why a command of `client` under `grant` is refused now, with a code of the protocol; None: obeyed."""
         held = self.held.get(grant)
         newer = (grant.term, grant.seq) > (self.term, self.seq) and not absurd(grant.term, self.term)
         if held is not None and held.holder.client != client:

@@ -26,8 +26,7 @@ class InstanceState(enum.Enum):
 
 
 class Instances:
-    """Follows the instances of `rc`. `patience`: seconds after which no program can use a vanished instance's
-    device."""
+    """Instances of `rc`. `patience`: seconds after which no program can use a vanished instance's device."""
 
     def __init__(
         self,

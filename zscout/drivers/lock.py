@@ -39,8 +39,7 @@ class LockHolder(NamedTuple):
 
 @contextmanager
 def only_here(fleet: str, host: str, rc: str, folder: Path | None = None) -> Iterator[None]:
-    """Raises MeshError if another process of this user or root offers `rc` of `fleet` for `host`. `folder`: state
-    folder."""
+    """Raises MeshError if another process of this user or root offers `rc` of `fleet` for `host`."""
     with ExitStack() as stack:
         if folder is not None:
             stack.enter_context(_file(folder / "served" / rc, host, rc))

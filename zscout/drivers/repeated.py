@@ -24,8 +24,7 @@ class CommandMemory:
         self._hosts: OrderedDict[str, OrderedDict[tuple[str, str], Answered]] = OrderedDict()
 
     def is_new(self, sender: Sender, query: IncomingQuery[Command]) -> bool:
-        """Return False for a repeated command, which gets the same answer; without an id all are new. Raises
-        Refused."""
+        """Return False for a repeated command, which gets the same answer; never without an id. Raises Refused."""
         if query.message.id is None:
             return True
         known, name = self._of(sender.host), (sender.client, query.message.id)

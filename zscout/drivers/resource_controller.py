@@ -588,8 +588,7 @@ class ResourceController:
             self.supervisor.spawn(self._forget_direct())
 
     async def _begin_held_back(self, *, at_once: Collection[messages.Holder]) -> None:
-        """Begin the holds at the driver that nothing holds back any more. Ended ones are skipped, and their `end`
-        too."""
+        """Begin the holds at the driver that nothing holds back any more; skip ended ones, and their `end`."""
         if self._making_safe is not None:
             return
         for grant, holder in list(self._held_back.items()):

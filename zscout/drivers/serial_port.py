@@ -184,8 +184,7 @@ class SerialPort:
         return getattr(self._port, "_socket", None)
 
     def _bound(self, seconds: float) -> None:
-        """Set how long TCP waits for its peer; longer while nothing is sent, as a lost keepalive probe is not
-        repeated."""
+        """Set how long TCP waits for its peer; longer while nothing is sent: a lost keepalive is not repeated."""
         if self._socket is not None and hasattr(socket, "TCP_USER_TIMEOUT"):
             self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, round(1000 * seconds))
 

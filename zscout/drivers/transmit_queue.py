@@ -238,8 +238,7 @@ class TransmitQueue:
         return round(max(self._free_at - now, Fraction(0)) + size * self._ns_per_byte)
 
     def next(self, now: Ns, in_force: Callable[[Grant], bool]) -> OutgoingPacket | None:
-        """Return the packet to write now, if there is one and the line has room. Packets of holds not `in_force` are
-        dropped."""
+        """The packet to write now, if any and the line has room. Packets of holds not `in_force` are dropped."""
         if self._free_at - now > self._ahead:
             return None
         self._release(now)

@@ -56,8 +56,7 @@ class UseCounter:
             use.since, use.direct = now if use.since is None else use.since, True
 
     def carried_out(self, grant: Grant, began: Ns, now: Ns) -> None:
-        """Count a command under a grant that was held at `began`. From a second thread, at worst one command's time is
-        lost."""
+        """Count a command of a hold in force at `began`. From a second thread, at worst its time is lost."""
         use = self._held.get(grant)
         if use is None:
             if (use := self._ended.get(grant)) is None:

@@ -120,10 +120,8 @@ def _own_addresses() -> set[str]:
 
 @dataclass(frozen=True, slots=True)
 class Called:
-    """Result of calling an address. `speaks` is empty without an answer; `problem` gives the reason.
-
-    For TLS: the server's certificate, its CA, `trusted` for a known CA, and the server's objection to our certificate,
-    empty if it has none."""
+    """Result of calling an address. `speaks` is empty without an answer; `problem` gives the reason. For TLS: the
+    server's certificate, its CA, `trusted` for a known CA, and its objection to our certificate, empty if none."""
 
     address: str
     speaks: Literal["tls", "plain", ""]

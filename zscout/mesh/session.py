@@ -82,10 +82,9 @@ class _Item(NamedTuple):
 
 @dataclass(slots=True)
 class Inbox:
-    """Carries calls from Zenoh's threads into the event loop, with one wake-up per burst.
-
-    Calls keep their order, except the surplus of a host: of its queries in one lane the first SHARE wait in the common
-    queue, the others until the common queue is empty."""
+    """Carries calls from Zenoh's threads into the event loop, with one wake-up per burst. Calls keep their order,
+    except the surplus of a host: of its queries in one lane the first SHARE wait in the common queue, the others until
+    that is empty."""
 
     loop: asyncio.AbstractEventLoop
     items: deque[_Item] = field(default_factory=deque)  # just arrived
@@ -454,9 +453,8 @@ class Mesh:
         depth: int = QUEUE_DEPTH,
         limit: int = messages.MAX_STATE,
     ) -> Declaration:
-        """Call `handler(key, message)` for every publication on `key`. Malformed publications are logged; while
-        `depth` of them wait, further ones are dropped and counted as missed. Equal subscriptions share one declaration
-        and decoding."""
+        """Call `handler(key, message)` for every publication on `key`. Malformed ones are logged; while `depth` of them
+        wait, further ones are dropped and counted as missed. Equal subscriptions share declaration and decoding."""
         alike = (key, kind, depth, limit)
         if alike not in self._shared:
             self._shared[alike] = self._subscribe(key, kind, depth, limit)
@@ -544,9 +542,8 @@ class Mesh:
         return sorted(token for token in map(self._token_of, found) if token is not None)
 
     def watch_links(self) -> None:
-        """Declare a token for this session until the mesh is left, and suspect links to sessions whose token
-        disappeared, unless their program shows another session (Zenoh may not close the old one). For long-running
-        programs."""
+        """Declare a token for this session, and suspect links to sessions whose token disappeared, unless their program
+        shows another session (Zenoh may not close the old one). For long-running programs."""
         name = functools.partial(Token, self.me.host, Role.SESSION, self.me.client)
         own = self._transport.own_token(lambda session: self.keys.alive(name(session)))
         # By session: the programs that show a token of it, and the program of the last change.

@@ -18,8 +18,7 @@ MAX_RC_COUNTER: Final = (LAST_TERMS + MAX_COUNTER) // 2
 
 
 class LastTerms:
-    """Queries other processes, one round at a time, when one of the last terms appears; `believe` gets the highest term
-    reported."""
+    """When one of the last terms appears, queries other processes, a round at a time; `believe` gets the highest."""
 
     def __init__(
         self, mesh: Mesh, supervisor: Supervisor, believe: Callable[[Term], object], *, timeout: float

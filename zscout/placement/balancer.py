@@ -265,8 +265,7 @@ class Balancer:
 
 
 class RankingCache:
-    """Rankings of one instant. A thousand hosts take milliseconds; only hosts changed by placements are ranked
-    again."""
+    """Rankings of one instant. A thousand hosts take milliseconds; only hosts changed since are ranked again."""
 
     def __init__(self, balancer: Balancer) -> None:
         self._balancer = balancer

@@ -228,8 +228,7 @@ class Lifecycle:
         state.wake(record, at)
 
     def check(self, record: ComponentRecord) -> Termination | None:
-        """Probe a running component without token or confirmation; reset a settled one's restarts. Returns its end, if
-        lost."""
+        """Probe a component without token or confirmation; reset a settled one's restarts. Returns its end, if lost."""
         state, host = self.state, record.host
         if record.running_since is not None and state.now - record.running_since >= state.rules.settled:
             record.restarts = 0

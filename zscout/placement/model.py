@@ -32,8 +32,7 @@ LEAST: Final = 0.01
 
 class Profile(NamedTuple):
     """Known or assumed use of a kind: `cpu` in cores of speed 1.0, `memory` in bytes. `threads`: the most cores it
-    wants, however slow. A component that computes all the time wants one core on any host; a paced one wants less of a
-    faster host."""
+    wants. A component that computes all the time wants one core on any host; a paced one less of a faster host."""
 
     cpu: float = 0.25
     memory: int = 64_000_000
@@ -96,8 +95,7 @@ NO_REPORT: Final = Unfit("no report of it")
 
 @dataclass(frozen=True, slots=True)
 class Ranking:
-    """Best first; `why`: how `metric` was chosen; `more`: ranked hosts not listed; `left_out`: why others can't be
-    used."""
+    """Best first; `why`: how `metric` was chosen; `more`: ranked hosts not listed; `left_out`: why, by host."""
 
     hosts: tuple[RankedHost, ...]
     metric: Metric

@@ -31,8 +31,7 @@ from zscout.types import ComponentId, HostName, Ns
 
 
 class Placer:
-    """`balancer` knows the hosts and learns placements; `counter` of the term makes incarnations higher than earlier
-    ones."""
+    """`balancer` knows the hosts and learns placements; with the term's `counter` incarnations rise by term."""
 
     def __init__(self, balancer: Balancer, counter: int, rules: PlacementPolicy = DEFAULT_PLACEMENT) -> None:
         self._state = state = PlacementState(balancer, counter, rules)

@@ -50,8 +50,7 @@ class Rebalancer:
             self.migrations.begin(state.components[component], to, f"where it runs {gain:.0%} better")
 
     def _changes(self) -> dict[_Move, float]:
-        """Moves that would pay now, each with its relative gain in speed; of equal components on a host the first by
-        name."""
+        """Moves that pay now, with their relative gains in speed; of equal components on a host the first."""
         state = self.state
         groups: dict[tuple[HostName, RankQuery], ComponentRecord] = {}
         running: Counter[HostName] = Counter()

@@ -1,5 +1,4 @@
-"""The placer's state and the few operations that change it; `lifecycle`, `migration`, `rebalancing` and `reconciler`
-decide."""
+"""The placer's state and the operations on it; `lifecycle`, `migration`, `rebalancing` and `reconciler` decide."""
 
 from __future__ import annotations
 
@@ -84,8 +83,7 @@ def host_gone(host: HostName | None) -> Termination:
 
 @dataclass(slots=True)
 class Migration:
-    """The target starts (`starting`), the source hands over (`handing_over`), or both are asked how it ended
-    (`probing`)."""
+    """The target starts (`starting`), the source hands over (`handing_over`), or both are asked (`probing`)."""
 
     to: HostName
     incarnation: Incarnation

@@ -47,8 +47,7 @@ class Authority:
         self._runtimes = fleet.min_runtime, fleet.command_min_runtime
 
     def bound(self, policy: SchedulingPolicy) -> SchedulingPolicy:
-        """The policy with the rights and limits that the scheduler enforces. A name belongs to the first of its
-        groups."""
+        """The policy with the rights and limits for the scheduler. A name belongs to the first of its groups."""
         policy = self.limits.bound(policy)
         if policy.fair_shares is not None:
             # Reversed, so that the first group of a name overwrites the others.

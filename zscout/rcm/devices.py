@@ -199,8 +199,7 @@ class ExpectedDevices:
         return f"it is gone from {host}" if host in self._living else f"the node of {host} is gone"
 
     def view(self, known: RcView, now: Ns, named: HostName | None) -> RcView:
-        """The RC for `status` and the web page. `known`: by scheduler and its report; `named`: its named instance's
-        host."""
+        """For `status` and the web page. `known`: by scheduler and RC; `named`: its named instance's host."""
         device = self._devices.get(known.rc, _Device())
         living = sorted(host for host, home in device.homes.items() if home.instances)
         gone = {host: home for host, home in device.homes.items() if not home.instances}

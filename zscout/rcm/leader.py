@@ -95,8 +95,7 @@ class Leader:
         self._out = steps.Outbox()
 
     def step(self, now: Ns, stimuli: Iterable[steps.Stimulus] = ()) -> Iterator[steps.Outbox]:
-        """Yield the Outbox of this instant in parts. Carry out each before taking the next; stop when no longer
-        leading."""
+        """Yield this instant's Outbox in parts. Carry out each before the next; stop when no longer leading."""
         self._now, out = now, steps.Outbox()
         self._out = out
         self._bookings.at(now)

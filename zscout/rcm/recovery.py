@@ -112,8 +112,7 @@ def take_over(
     record_of: Callable[[str], BookingRecord | None] = lambda _: None,
 ) -> RecoveredState:
     """Recover the state for a new leader. RCs whose gangs have not all answered are `pending`: their holds are not
-    decided. `home_of`: the host of an RC by the fleet file; an RC free elsewhere joins later, as its device may be in
-    use at home."""
+    decided. `home_of`: an RC's host by the fleet file; an RC free elsewhere joins later: its device may be in use."""
     states = [state for state in states if state.holders or home_of(state.rc) in (None, state.host)]
     # Of two instances of an RC, name the instance with the newest hold, else the one at home.
     by_host = sorted(states, key=attrgetter("host", "instance"), reverse=True)
@@ -252,8 +251,7 @@ def recover(
     known: Callable[[ArcId], ArcStatus | None] = lambda _: None,
     undecided: Collection[tuple[ArcId, Grant | None]] = (),
 ) -> RecoveredState:
-    """Combine the answers, without malformed parts. `known`: ARCs open here already; `undecided`: holds of pending
-    RCs."""
+    """Combine the answers, without malformed parts. `known`: open ARCs; `undecided`: holds of pending RCs."""
     result = RecoveredState(rcs={state.rc: state for state in states})
     result.answered = {answer.client for answer in clients}
     listed = _listed(result, clients, admission, record_of)

@@ -213,8 +213,7 @@ class RequestLog:
         return [upcoming_info(end, now) for end in ends]
 
     def interrupted(self, now: Ns, arc: ArcId, believed: Grant) -> Notice:
-        """The state of a queued request whose client believes in a hold: with its end, as lost if that is unknown
-        here."""
+        """The state of a queued request whose client believes in a hold: with its end, `lost` if unknown here."""
         known = self._requests.get(arc)
         notice, ending = self.notice(now, arc), None if known is None else known.ending
         if ending is None or ending.grant != believed:

@@ -143,8 +143,7 @@ class Roster:
         self._out = Outbox()
 
     def start(self, now: Ns, rcs: Iterable[RcState], pending: Iterable[RcState], *, patient: bool) -> Outbox:
-        """Begin with RCs that promised before the term began. `patient`: the gangs of `pending` RCs have a lease to
-        answer."""
+        """`rcs` promised before the term began. `patient`: the gangs of `pending` RCs have a lease to answer."""
         self._now = now
         joined, waiting = list(rcs), list(pending)
         alone = all(state.host == self.sight.me for state in (*joined, *waiting))
@@ -461,8 +460,7 @@ class Roster:
         return [keys[host] for host in sorted(keys) if host != self.sight.me]
 
     def _counts(self, token: Token, *, alive: bool, known: bool) -> bool:
-        """Return True if the appearance or disappearance of a token counts: the token is among its host's first
-        MAX_TOKENS."""
+        """Return True if a token's change counts: the token is among the first MAX_TOKENS of its host."""
         if alive is known:
             return alive
         if self.sight.count(token.host, alive=alive):

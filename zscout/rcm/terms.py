@@ -115,8 +115,7 @@ class Terms:
         return not self.secured or (source is not Source.CLIENT and term > self._led)
 
     def _doubted(self, word: Word, now: Ns) -> Ns:
-        """Note the term that an RC shows. Return when its host is believed again; 0: now, or other hosts show it
-        too."""
+        """Note the term that an RC shows. Return when its host is believed again; 0: now, or others show it."""
         term, host = word.term, word.host
         if term <= self._led or term in self._tried:
             return 0

@@ -138,8 +138,7 @@ class BookingBound(Struct, frozen=True):
 
 
 class BookingConflict(Struct, frozen=True):
-    """A booking can't be kept: booking `by` excludes it or, if `by` is empty, no RC for its patterns is free. None: it
-    is kept again."""
+    """Excluded by booking `by` or, if `by` is empty, as no RC for its patterns is free. None: it is kept again."""
 
     booking: str
     by: str | None

@@ -384,8 +384,7 @@ class ConflictGroup:
         return sum(1 << self._number[arc] for arc in holders if arc in self._number)
 
     def _taker(self, victim: Arc, starting: list[Arc]) -> Arc:
-        """The ARC that takes the hold: the best newcomer that needs one of its exclusive RCs, else sharable ones, else
-        any."""
+        """The taker of the hold: the best newcomer that needs its exclusive RCs, else its sharable RCs, else any."""
         entitled = [arc for arc in starting if victim.preemptible_by(arc, self.state.now)] or starting
         exclusive = ~self.state.sharable
         for mask in (victim.mask & exclusive, victim.mask):

@@ -658,8 +658,7 @@ class Core:
         self._run_again = True
 
     def _end_hold(self, arc: Arc, outcome: Outcome, reason: Reason, *, requeue: bool = True) -> None:
-        """End a hold. Its ARC is not queued again past its minimum runtime, or with an RC that its owner may not
-        hold."""
+        """End a hold. Its ARC is not queued again past its minimum runtime, or with an RC barred to its owner."""
         requeue = requeue and not arc.past_min_runtime(self._state.now) and not self._state.is_barred(arc)
         hold = self._state.stop(arc)
         self._effects.append(self._revocation(arc, hold, outcome, reason, requeued=requeue))

@@ -113,8 +113,7 @@ class Shares:
             self._count(arc, by)
 
     def count_absent(self, rc: Rc, arcs: Iterable[Arc], by: int) -> None:
-        """Count in (1) before `rc` joins, or out (-1) before it leaves, the queued ARCs whose other named RCs are all
-        present."""
+        """Count in (1) before `rc` joins, or out (-1) before it leaves, the ARCs that lack no other named RC."""
         others = self._state.present & ~rc.bit
         for arc in arcs:
             if arc.named_mask & rc.bit and not arc.named_mask & ~rc.bit & ~others:

@@ -58,8 +58,7 @@ class Forecast:
 def forecast(
     core: Core, now: Ns, newcomer: ArcRequest | None = None, runtimes: RuntimeEstimator | None = None
 ) -> Forecast:
-    """Play a copy of `core` forward from `now`, where `newcomer` enters first. With `runtimes`, holds end when they
-    usually do."""
+    """Play a copy of `core` forward from `now`, with `newcomer` first. With `runtimes`, holds end as usual."""
     # A copy, as a strategy may keep unfinished searches.
     copy = Core(STRATEGIES[core.strategy.name](), core.policy, assume_latest_begin=True)
     booked = {booking.id: (booking, arc is None) for booking, arc in core.bookings()}

@@ -431,8 +431,7 @@ class RcBegins(Struct, frozen=True):
 
 
 class RcUnwell(Struct, frozen=True):
-    """A present RC is unwell: its holders keep it, and it is granted to operators only. `why` is empty once it is
-    well."""
+    """A present RC is unwell: holders keep it, and it is granted to operators only. An empty `why`: it is well."""
 
     rc: RcName
     why: str = ""

@@ -104,8 +104,7 @@ class PackingProblem:
         return self.value(chosen), -sum(item.in_min_runtime for item in left_out)
 
     def complete(self, preferred: int = 0) -> int:
-        """A maximal feasible set by level: running, `preferred`, then other items. Without `preferred`: the
-        heuristic's."""
+        """A maximal feasible set by level: running, `preferred`, other items. Default: the heuristic's set."""
         items, masks = self.items, self.masks
 
         def order(number: int) -> tuple[int, int]:

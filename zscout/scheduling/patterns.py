@@ -81,8 +81,7 @@ class Choices:
         self._found: dict[tuple[int, int], Mapping[Need, RcName] | None] = {}
 
     def best(self, *, without: int = 0, claimed: int = 0) -> Mapping[Need, RcName] | None:
-        """The best binding outside `without`, where the `claimed` RCs are bound to others (bit masks); None: there is
-        none."""
+        """The best binding outside `without`, where others are bound to `claimed` RCs (bit masks); None: none."""
         key = without, claimed & self.contended
         if key not in self._found:
             self._found[key] = self._bind(*key)
@@ -379,8 +378,7 @@ def distinct(allowed: dict[Need, list[Rc]]) -> dict[Need, Rc] | None:
 
 
 def _apart(allowed: dict[Need, list[Rc]]) -> dict[Need, Rc] | None:
-    """The choice of `distinct`, if any two needs have the same RCs or none in common; None: they don't, or it is
-    impossible."""
+    """`distinct`, if any two needs have the same RCs or none in common; None: they don't, or it is impossible."""
     lists = {id(rcs): rcs for rcs in allowed.values()}
     seen = 0
     for rcs in lists.values() if len(lists) > 1 else ():

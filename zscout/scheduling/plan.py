@@ -159,8 +159,7 @@ class _DryRun:
         return held and not (reach & self._movable and self._has_paths(arc))
 
     def _has_paths(self, arc: Arc) -> bool:
-        """Return False if `arc` can't start by a path: nothing is free or may end for it, or its class has found
-        none."""
+        """Return False if no path can free an RC for `arc`: nothing is free or may end, or its class found none."""
         state = self.state
         if arc.like is not None and self._failed.get(arc.like) == state.version:
             return False
@@ -321,8 +320,7 @@ class _Paths:
         self._owner[rc.bit] = arc, need
 
     def add(self) -> bool:
-        """Find separate RCs for all needs of the ARC to add; the others keep theirs or move. Return False if there are
-        none."""
+        """Find separate RCs for all needs of the ARC; others keep theirs or move. Return False if impossible."""
         state, arc = self._state, self._arc
         wanted: dict[Need, int] = {rc.name: rc.bit for rc in state.rcs_in(arc.named_mask & ~state.sharable)}
         for need, mask in class_of(arc).masks.items() if arc.patterns else ():

@@ -66,8 +66,7 @@ class QueueIndex:
         del self._not_starving[:count]
 
     def next_starving(self, now: Ns) -> Ns | None:
-        """When the next ARC begins to starve, if others do already: their later reservations may then let an ARC
-        pass."""
+        """When the next ARC begins to starve, if others do: their reservations may then move, and let ARCs pass."""
         coming = bisect_right(self._not_starving, now, key=itemgetter(0))
         return self._not_starving[coming][0] if self.starving and coming < len(self._not_starving) else None
 
@@ -75,8 +74,7 @@ class QueueIndex:
         return -self._band(arc.priority), arc.starves, arc.id
 
     def sort(self, queued: Mapping[ArcId, Arc], rcs: Iterable[Rc]) -> None:
-        """Rebuild the order after ranks and waiting times have changed; `rcs` are watched. Starving ARCs must be
-        marked again."""
+        """Rebuild the order after changes of ranks and waits; `rcs` are watched. Mark starving ARCs again."""
         self._not_starving = sorted((arc.starves, arc.id) for arc in queued.values())
         for _, _, arc_id in self.starving:
             queued[arc_id].starving = False

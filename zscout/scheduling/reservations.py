@@ -223,8 +223,7 @@ class Reservations:
         return arc.since + arc.late + arc.patience
 
     def free_until(self, arc: Arc, end: Ns) -> Ns:
-        """When its RCs are next reserved, at most `end`; its own and lower-priority starving ARCs' times don't
-        count."""
+        """When its RCs are next reserved, at most `end`; not its own time, nor lower-priority starving ARCs'."""
         now, band = self._state.now, self._state.band
         for rc in self._state.rcs_in(arc.mask & self.bits):
             for promise in self.at(rc, now, end):
@@ -291,7 +290,7 @@ class Reservations:
     def _together(self, rc: Rc, arc: Arc, before: list[Reservation]) -> list[HolderSet]:
         """The sets of holders to ask `rc` about if `arc` starts now: one for now, and one for each promised ARC that
         arrives before its end. A set has no holder that yields to the arriving ARC. It includes the promised ARCs that
-        may be there: a starving ARC may start before its reserved time, but not before an ARC with an earlier
+        may be there: a starving ARC may start earlier than reserved, but not before an ARC with an earlier
         reservation."""
         now, end = self._state.now, arc.ends(self._state.now)
         sets = []

@@ -199,16 +199,14 @@ class SchedulerState:
         return self.present & ~self.unwell if self.unwell and not self.operator(priority) else self.present
 
     def closed_to(self, arc: Arc) -> int:
-        """Bits of its RCs that are absent or, unless it continues an ARC that has them, unwell and not granted to
-        it."""
+        """Bits of its RCs that are absent or, unless it continues their holder, unwell and not granted to it."""
         closed = arc.mask & ~self.open_to(arc.priority)
         if closed & self.present and (continued := self.continued(arc)) is not None:
             closed &= ~(continued.mask & self.present)
         return closed
 
     def is_free(self, arc: Arc) -> bool:
-        """Return True if a new ARC starts at once: no queue, quota or pattern; its RCs are exclusive, free, not
-        booked."""
+        """Return True if a new ARC starts at once: no queue, quota or pattern; exclusive, free, unbooked RCs."""
         if self.queued or self.held_back or arc.patterns or arc.place in self._at_place:
             return False
         if arc.mask & self.dates.claimed:

@@ -141,8 +141,7 @@ class Votes:
         return [rc for rc in self.unresponsive if self._by_rc[rc].retry_at <= now]
 
     def propose(self, rc: RcName, holders: HolderSet, now: Ns) -> int | None:
-        """Return the number of a new proposal; None if one is open or the RC, if unresponsive, was asked within a
-        quantum."""
+        """The number of a new proposal; None if one is open or the RC, if unresponsive, was just asked."""
         votes = self._by_rc[rc]
         if rc in self.unresponsive:
             if now < votes.retry_at:

@@ -54,8 +54,7 @@ def replay(
     lasting: Mapping[ArcId, Ns] = MappingProxyType({}),
 ) -> Replay:
     """Run the workload to its end. `watch` is called with the core after each batch. `lasting`: by ARC, when its
-    program releases its hold (ns), if before its minimum runtime. Holds kept beyond that end when no other event is
-    left."""
+    program releases its hold (ns), if before its minimum runtime. Holds kept longer end when no other event is left."""
     core = Core(strategy, policy)
     capacity = {rc.name: rc.capacity for rc in workload.rcs if rc.sharable}
     runtime = {arrival.request.arc: arrival.request.min_runtime for arrival in workload.arrivals}

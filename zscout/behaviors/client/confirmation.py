@@ -201,7 +201,7 @@ class Confirmations:
         deadline: Ns,
         first: tuple[Ns, Done | Problem | None],
     ) -> CommandRefused | None:
-        """Ask one RC until it confirms or refuses; return its refusal. `first`: when the host was asked, and its
+        """Ask one RC until it confirms or refuses; return its refusal. `first`: time of its host's query, its
         answer."""
         pause, (sent, answer) = BACKOFF[0], first
         while True:
@@ -247,8 +247,7 @@ class Confirmations:
         self._mesh.suspicions.suspect(f"{rc} {what}", so=silent, patience=patience)
 
     async def _ask_when_reachable(self, arc: OpenArc, rcs: list[RcName]) -> None:
-        """Let `arc` be granted again as soon as these RCs' tokens have disappeared and returned: then links are
-        back."""
+        """Let `arc` be granted again once these RCs' tokens have disappeared and returned: links are back."""
         keys, back = self._mesh.keys, asyncio.Event()
         gone = {rc for rc in rcs if not await self._mesh.living(keys.alive_rc(rc), timeout=QUERY_TIMEOUT)}
 

@@ -94,8 +94,7 @@ class DirectHold:
         return self.ended_at is not None
 
     def watch(self, watcher: Callable[[DirectHold], object]) -> None:
-        """Call `watcher(hold)` when `gone_by` changes, and at the hold's end before `leaving` is sent. It must not
-        block."""
+        """Call `watcher(hold)` when `gone_by` changes, and at the end before `leaving` is sent. Must not block."""
         self._watchers.append(watcher)
 
     def returned(self) -> None:

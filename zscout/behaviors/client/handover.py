@@ -128,8 +128,7 @@ class MovableClient:
                 await self.rcm.end(arc)
 
     def pause(self) -> None:
-        """Until `resume`, `take_back`, `close` or `leave`, submit and end no request, and interrupt no body; apply
-        notices."""
+        """Until `resume`, `take_back`, `close` or `leave`, only apply notices: submit, end, interrupt nothing."""
         self._may_end.clear()
         self.store.resumed.clear()
         self.store.undecided.clear()
@@ -233,10 +232,8 @@ class MovableClient:
         return {request.id for request in requests if request.place is None}
 
     def take_back(self) -> None:
-        """Continue with all requests after the client that received them is gone: submit each again, at its place.
-
-        Bodies are interrupted as for any other lost hold. If a hand-over of unknown outcome did not happen, its
-        requests stay unchanged."""
+        """Submit all requests again, at their places: the client that received them is gone. Bodies are interrupted as
+        for any lost hold. If a hand-over of unknown outcome did not happen, its requests stay unchanged."""
         for arc in list(self.store.moved.values()):
             self.store.reclaim(arc)
         self.store.reclaimed, self.store.undecided = self.store.undecided, set()

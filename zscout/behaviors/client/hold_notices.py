@@ -1,5 +1,5 @@
-"""Notices to a holder of the request, booking or maintenance to which its hold yields next. Pure; times in ns on this
-host's clock."""
+"""Notices to a holder of what its hold yields to next: a request, booking, maintenance. Pure; times in ns on this
+host."""
 
 from __future__ import annotations
 

@@ -23,8 +23,7 @@ def this_program(host: str) -> Who:
 
 
 def host_of(fleet: Fleet) -> str:
-    """This program's host in keys: its certificate's name; without certificates $ZSCOUT_HOST, else this machine. Raises
-    BadInput."""
+    """In keys: its certificate's name; without certificates $ZSCOUT_HOST, else this machine's. Raises BadInput."""
     if fleet.security is not None:
         return read_certificates(fleet.security).name
     return os.environ.get("ZSCOUT_HOST") or this_machine()

@@ -90,8 +90,7 @@ class ClientInternals(MovableClient):
             await self.leave()
 
     async def leave(self) -> None:
-        """Leave the mesh without giving anything back: all was handed over. The RCM ends the rest as the token
-        disappears."""
+        """Leave the mesh after all was handed over. The RCM ends the rest when the token disappears."""
         self.leaving = self.leaving or asyncio.create_task(self._leave())
         # Its token must go even if the caller is cancelled.
         await asyncio.shield(self.leaving)
@@ -161,8 +160,7 @@ class ClientInternals(MovableClient):
         self.store.forget(arc)
 
     def _give_back_unreported(self, request_id: str) -> None:
-        """Give back a hold that expired here without a notice: the leader may have granted it again, and that was
-        lost."""
+        """Give back a hold that expired here without a notice: the leader's renewed grant may be lost."""
         expired = request_id in self._expired
         self._expired.discard(request_id)
         if expired and request_id not in self.store.arcs:  # it may have been submitted again

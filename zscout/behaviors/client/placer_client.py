@@ -62,8 +62,7 @@ class PlacerClient:
         return await self.request(messages.EndComponent(component, wait=wait), Placement)
 
     async def request(self, operation: PlacerOperation, kind: type[R]) -> R:
-        """Repeat an operation, which must be idempotent, until a placer answers. Raises RequestRefused,
-        PlacerSilent."""
+        """Repeat an idempotent operation until a placer answers. Raises RequestRefused, PlacerSilent."""
         silent = f"the component placer of fleet {self.mesh.keys.fleet} did not answer for {self._timeout:.0f} s"
         remedy = "see zscout status, and the leader's log of zscout-node"
         return await self._until(lambda: self._ask(operation, kind), f"{silent}; {remedy}")
@@ -102,8 +101,7 @@ class PlacerClient:
             self._listed(listed)
 
     async def wait_changed(self) -> None:
-        """Wait for a publication or answer; after REFRESH_EVERY seconds, refresh. Raises RequestRefused,
-        PlacerSilent."""
+        """Wait for news; after REFRESH_EVERY seconds, refresh. Raises RequestRefused, PlacerSilent."""
         if not await done_within(REFRESH_EVERY, self.changed.wait()):
             await self.refresh()
         self.changed.clear()

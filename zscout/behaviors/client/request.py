@@ -39,8 +39,7 @@ class NoRcm(Exception):
 
 
 class CommandRefused(Exception):
-    """A device refused a command. `rc` names it, `code` is one of the codes of the protocol, or `unknown` if no
-    answer came."""
+    """A device refused a command. `rc` names it; `code` is the protocol's, or `unknown` if no answer came."""
 
     def __init__(self, rc: str, problem: Problem) -> None:
         super().__init__(f"{rc}: {problem.message}")
@@ -260,8 +259,7 @@ class OpenArc:
         self.state, self.since, self.why = "asking", now, None
 
     def _take_first(self, notice: Notice, now: Ns) -> bool:
-        """Apply the first notice of an expected request. Return False for an end, an outdated notice or other
-        devices."""
+        """Apply an expected request's first notice. Return False for an end, an old notice or other devices."""
         before, self.state = self.state, "asking"
         if notice.state != "ended" and self._take(notice, now):
             self._moved_in = notice.term

@@ -1,7 +1,5 @@
-"""Messages between a node and the process of a component: JSON objects over a socket pair, one per line.
-
-The node sends orders, the process sends reports.
-"""
+"""Messages between a node and the process of a component: JSON objects over a socket pair, one per line. The node sends
+orders, the process sends reports."""
 
 from __future__ import annotations
 
@@ -75,8 +73,7 @@ class OrderAnswer(msgspec.Struct, frozen=True, tag="answer"):
 
 
 class EndReport(msgspec.Struct, frozen=True, tag="ends"):
-    """The last report: how the component ended, and a reason for people. `bad_params`: don't restart it, on any
-    host."""
+    """The last report: how the component ended, and why, for people. `bad_params`: don't restart it, on any host."""
 
     how: HowEnded
     reason: str = ""
@@ -95,8 +92,7 @@ def pack(message: msgspec.Struct) -> bytes:
 
 
 def receive(connection: BinaryIO, kind: Any) -> Any:
-    """Return the next message, of `kind`, or None once the other side has closed, even within a frame. Raises
-    BadFrame."""
+    """The next message, of `kind`; None once the other side has closed, even within a frame. Raises BadFrame."""
     try:
         line = connection.readline(MAX_FRAME)
     except ConnectionError:

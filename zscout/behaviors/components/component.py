@@ -1,7 +1,5 @@
-"""The base class of components, and the context in which they run; docs/components.md has an example.
-
-zscout finds a component class by its entry point in the group `zscout.components`.
-"""
+"""The base class of components, found by its entry point in the group `zscout.components`, and the context in which
+they run; docs/components.md has an example."""
 
 from __future__ import annotations
 
@@ -23,8 +21,7 @@ BAD_PARAMS: Final = 78
 
 
 class Component:
-    """Base class of components. Each runs in a process of its own, which makes the instance before it joins the
-    mesh."""
+    """Base class of components. Each has its own process, which makes the instance before it joins the mesh."""
 
     def __init__(self, params: dict[str, Any]) -> None:
         """Raise ValueError, with one line, for invalid `params`: the component is then given up, with that line as its

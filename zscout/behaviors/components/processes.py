@@ -1,7 +1,6 @@
 """Kill all processes of a component, and limit their memory.
 
-They are recognized by a variable in their environment, which children inherit, even in a process group of their own.
-"""
+A variable in their environment marks them, which children inherit, even in a process group of their own."""
 
 from __future__ import annotations
 

@@ -93,8 +93,7 @@ class NetParams(SharedParams):
 
 
 class TreeComponent(Component):
-    """Performs and checkpoints the tree `root`, publishes its status, and prints changes and alerts for `component
-    logs`."""
+    """Performs and checkpoints the tree `root`, publishes its status, prints changes and alerts for its logs."""
 
     root: Behavior
     speed: float

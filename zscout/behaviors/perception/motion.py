@@ -166,8 +166,7 @@ class _Near:
 
 class MotionDetector:
     def __init__(self, *, outlines: bool = False, limits: MotionLimits | None = None) -> None:
-        """With `outlines`, also report moving pixels, and fit boxes to them. `limits.min_duration` is the
-        EventTracker's."""
+        """With `outlines`, also report moving pixels, and fit boxes. `limits.min_duration` is for EventTracker."""
         self._limits = limits or MotionLimits()
         self._ignored: Mask | None = None  # 255 where motion does not count; None without such regions
         self._smallest = max(SMALLEST, self._limits.min_area)
@@ -364,8 +363,7 @@ class MotionDetector:
         self._variance += rate * (away * away - self._variance)
 
     def _regions(self, score: _Plane, level: _Plane, time: float) -> tuple[NDArray[np.uint8], _Regions, _Regions]:
-        """Return regions of pixels above WEAK with some above STRONG: mask (255 or 0), stats, stats of certain
-        regions."""
+        """Regions of pixels above WEAK, some above STRONG: mask (255 or 0), stats, stats of certain regions."""
         weak = (score > WEAK).astype(np.uint8)
         # Torn lines and hot pixels are thinner than anything that moves.
         thick = np.asarray(cv2.morphologyEx(weak, cv2.MORPH_OPEN, np.ones((3, 2), np.uint8)), np.uint8)

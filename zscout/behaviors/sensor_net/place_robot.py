@@ -52,8 +52,7 @@ class Slots:
     watch: float = 30.0
 
     def of(self, task: Task, *, sooner: bool = False) -> tuple[int, float]:
-        """Priority and minimum runtime (s) of a task's ARC. `sooner` shortens a watch a little: shorter requests go
-        first."""
+        """Priority and minimum runtime (s) of a task's ARC. `sooner`: a little shorter, to be granted first."""
         if task == "hide":
             return self.hide_priority, self.hide
         return self.watch_priority, self.watch * (SOONER if sooner else 1)

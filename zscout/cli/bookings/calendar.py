@@ -119,8 +119,7 @@ def _write(path: Path, text: bytes) -> bool:
 
 
 def parse_needs(text: str, option: str) -> Pairs:
-    """Parse `robot/arm1,framegrabber/*,radio/rf0:command_rate=5`; a repeated pattern asks for one more. Raises
-    BadInput."""
+    """Parse `robot/arm1,framegrabber/*,radio/rf0:command_rate=5`; a repeated pattern: one more. Raises BadInput."""
     if not text:
         raise BadInput(f"{option}: names no device; write one, as in robot/arm1")
     return tuple(gather_needs([parse_need(need, option) for need in _NEXT_NEED.split(text)]).items())

@@ -80,8 +80,7 @@ class CalendarEvent:
 
 
 def read_calendar(data: bytes, source: str) -> list[CalendarEvent]:
-    """In the file's order; an event that can't be read has a `problem`. Raises BadInput for no calendar, or a large
-    file."""
+    """In the file's order; an unreadable event has a `problem`. Raises BadInput for no calendar, or a large file."""
     where = Where(source)
     if len(data) > MAX_BYTES:
         raise where.bad(f"has more than {MAX_BYTES:,} bytes", "export less, such as only the coming year")

@@ -74,8 +74,8 @@ class Displaced:
         }
 
     async def agree(self, name: str, *, yes: bool) -> None:
-        """Print the lines on stderr, and ask if anything is displaced. Raises Failed for a no, or without a terminal
-        (exit 2)."""
+        """Print the lines on stderr; ask if anything is displaced. Raises Failed: for a no; without a terminal, code
+        2."""
         for line in self.lines():
             print_line(clean(f"{name} {line}"), sys.stderr)
         if self and not yes:

@@ -30,8 +30,7 @@ DAYS_OF_WEEK: Final = ("MO", "TU", "WE", "TH", "FR", "SA", "SU")
 
 @dataclass(frozen=True, slots=True)
 class RepeatRule:
-    """`by_day`: (number in the month or 0 for all, weekday from Monday, 0). Empty parts follow the event's first
-    date."""
+    """`by_day`: (number in the month or 0 for all, weekday from Monday, 0). Empty parts follow the first date."""
 
     freq: str
     interval: int = 1

@@ -51,8 +51,7 @@ async def show_keys(*, as_json: bool) -> None:
 
 def served(own: Keys, token: Token, sharable: set[str] | None) -> list[dict[str, Any]]:
     """The keys of the participant with this token. `how`: query (it answers), put (it publishes) or hear (it
-    subscribes). `sharable`: the RCs that vote; None: unknown. On a secured fleet keys of queries have the asker's
-    name."""
+    subscribes). `sharable`: the RCs that vote; None: unknown. On a secured fleet keys of queries have the asker."""
     match token.role:
         case Role.RCM:
             found = [

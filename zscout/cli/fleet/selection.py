@@ -16,8 +16,7 @@ from zscout.messages import HoldView, RcmState, WaitView
 
 @dataclass(slots=True)
 class Selection:
-    """A part of `state` and `hosts`, or all without `names`, which may be patterns; `homes`: the host of each
-    device."""
+    """A part of `state` and `hosts`, or all without `names`, which may be patterns; `homes`: devices' hosts."""
 
     names: Sequence[str]
     state: RcmState | None

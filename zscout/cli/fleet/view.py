@@ -144,8 +144,8 @@ async def view(
 async def open_viewer(
     recording: Recording, *, web: bool, bind: str = "127.0.0.1", port: int | None = None, stream: int = 0
 ) -> AsyncIterator[tuple[Child, str | None]]:
-    """Open a viewer with the recording, live if it has a `url`. Yield it, and with `web` the page's address once it is
-    served. port: of the page; None: any. stream: port on which a file is served to the page; 0: any. Raises BadInput,
+    """Open a viewer with the recording, live if it has a `url`. Yield it, and with `web` the page's address once
+    served. port: of the page; None: any. stream: port for a file's data to the page; 0: any. Raises BadInput,
     Failed."""
     shown = recording.url or recording.file
     if not web:
@@ -245,8 +245,8 @@ def _is_node(fleet: Fleet, host: str) -> bool:
 
 
 async def _reached(recorded: Recorded, bind: str) -> Recording | None:
-    """The recording if a recorder of this host writes and serves it. `bind`: of the page; its browsers must reach the
-    stream as well."""
+    """The recording if a recorder of this host writes and serves it. `bind`: of the page; browsers that open it must
+    reach the live stream as well."""
     address = await asyncio.to_thread(local_address, recorded, bind)
     if address is None:
         return None

@@ -87,8 +87,7 @@ class Overview:
 
 
 class Scrolled:
-    """The part of an overview that fits a terminal: headline, lines of tables from the one that keys chose, and a
-    hint."""
+    """The part of an overview that fits a terminal: headline, lines of tables from the chosen one, and a hint."""
 
     def __init__(self) -> None:
         self._first = self._last = 0

@@ -197,8 +197,7 @@ class HoldCommand(click.Command):
 
 
 def _infra_exit_in(args: Sequence[str]) -> int | None:
-    """The value of --infra-exit before other options are parsed, since any may be wrong. None: missing, or bad (click
-    reports it)."""
+    """--infra-exit before other options are parsed, as any may be wrong. None: missing, or bad (click reports it)."""
     for at, arg in enumerate(args):
         name, equals, value = arg.partition("=")
         if name == INFRA_EXIT:

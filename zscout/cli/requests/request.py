@@ -297,8 +297,7 @@ async def _report_dates(report: Report, held: Held, client: Client) -> None:
 async def report_notices(
     report: Report, held: Held, client: Client, noticed: Callable[[HoldNotice, str], object] = lambda *_: None
 ) -> None:
-    """Report the next booking of each device, and each notice until the hold is over; call `noticed` with it and its
-    words."""
+    """Report the next booking of each device, and notices until the hold is over; `noticed` gets each in words too."""
     async with common.beside(_report_dates(report, held, client)):
         await _report_each(report, held, User.of(client), noticed)
 

@@ -139,8 +139,7 @@ class RunningCommand:
         self._send(f"until {at}")
 
     async def wait(self) -> int:
-        """Wait until the command and all processes that it left are ended. Return its exit code, 128 + n by signal
-        n."""
+        """Wait until the command and all its processes are ended. Return its exit code, 128 + n by signal n."""
         await self._wait_until_gone()
         return self._code if self._code >= 0 else 128 - self._code
 

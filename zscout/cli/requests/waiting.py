@@ -1,5 +1,5 @@
-"""The contention for a request: by need, the devices that meet it and the requests that hold them, from the leader's
-state."""
+"""The contention for a request: by need, the devices that meet it and the requests that hold them, as the leader
+knows."""
 
 from __future__ import annotations
 
@@ -69,8 +69,7 @@ class NeedContention:
 
 
 def contention_of(state: RcmState, needs: Collection[str], own: str = "") -> list[NeedContention]:
-    """Without holds of the request `own` (`<host>/<client>/<id>`). A device that a need names does not meet a
-    pattern."""
+    """Without holds of the request `own` (`<host>/<client>/<id>`). A device named by a need meets no pattern."""
     holds = [hold for hold in state.holds if f"{hold.client}/{hold.id}" != own]
     views = {view.rc: view for view in state.rcs}
 
@@ -104,8 +103,7 @@ def whose(view: HoldView | WaitView | ReasonParty) -> str:
 def request_words(
     arc: str, who: Who | None, client: str, params: Mapping[str, Decimal] | None = None, me: User | None = None
 ) -> str:
-    """`survey (alice@ws1)`, with the `params` under which it holds a device; `your own request survey` if it is
-    `me`'s."""
+    """`survey (alice@ws1)`, with the `params` under which it holds a device; `your own request survey` for `me`."""
     name = _own_words(arc) if me is not None and me.owns(client.partition("/")[0], who) else named(who, client, arc)
     return clean(common.with_amounts(name, params or {}))
 
@@ -120,8 +118,7 @@ def comment(who: Who | None) -> str:
 
 
 def reason_text(reason: str, why: ReasonInfo | None, age: float = 0, me: User | None = None) -> str:
-    """Words for the reason that a request of `me` waits, `age` seconds after it was sent; times by this host's
-    clock."""
+    """Words for why a request of `me` waits, `age` seconds after that was sent; times by this host's clock."""
     known = reason_of(why)
     if known is None:
         return reason

@@ -87,8 +87,7 @@ async def _past_holds(client: Client, arc: str, unknown: common.Failed) -> list[
 
 
 async def _described(client: Client, view: View, state: RcmState) -> dict[str, Any]:
-    """With its own story, without other requests of its name. In a hold `need` is as requested, and `rc` the device
-    that meets it."""
+    """With its story, without other requests of its name. In a hold `need` is as requested, `rc` its device."""
     story = (await common.state_of(client, _full(view))).story
     met = {rc: need for need, rc in view.bound.items()} if isinstance(view, HoldView) else {}
     needs = []

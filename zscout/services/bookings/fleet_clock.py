@@ -24,8 +24,7 @@ def wall_ns(seconds: float) -> Ns:
 
 def agreed(times: Iterable[Ns], current: Ns | None = None, kept: Collection[Ns] = ()) -> Ns:
     """The median of several clocks at one instant. Of two middle ones: the nearer to the agreed time of those `kept` by
-    a time service; else to `current` fleet time, which more hosts may share; else the lower. Raises ValueError for no
-    clocks."""
+    a time service; else to `current` fleet time, which more hosts may share; else the lower. ValueError: no clocks."""
     all_times = sorted(times)
     if kept:
         current = agreed(kept, current)

@@ -59,8 +59,7 @@ class Journal:
         wall: Callable[[], float] = time.time,
         on_opened: Callable[[list[PastHold]], object] = lambda _: None,
     ) -> None:
-        """`wall`: seconds since 1970, UTC. `on_opened` is called once, in the event loop, with the latest holds, oldest
-        first."""
+        """`wall`: seconds since 1970, UTC. `on_opened` gets the latest holds once, in the loop, oldest first."""
         self._mesh, self._silent, self._wall, self._on_opened = mesh, silent, wall, on_opened
         self._store = JournalStore(folder, config.max_age / SECOND, config.max_size * MEGABYTE)
         self._supervisor = Supervisor(

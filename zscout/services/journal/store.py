@@ -94,8 +94,7 @@ class JournalStore:
         self._before = 0  # the last hold before this process: its times are of another clock
 
     def open(self) -> tuple[list[Grant], float | None]:
-        """Return the open holds and the last publication's time of the closed journal. Sets an unreadable file aside.
-        Raises Unwritable."""
+        """The closed journal's open holds and last publication. Sets a bad file aside. Raises Unwritable."""
         with self._one:
             try:
                 db = self._opened()

@@ -36,8 +36,7 @@ class OutputRing:
             del self._bytes[: -self._size]
 
     def read(self, start: int) -> tuple[int, int, str]:
-        """Start, end and text from byte `start`, with U+FFFD for invalid UTF-8, without an incomplete last
-        character."""
+        """Start, end and text from byte `start`; U+FFFD for invalid UTF-8; no incomplete last character."""
         first = min(max(start, self.start), self.end)
         decoder = codecs.getincrementaldecoder("utf-8")("replace")
         text = decoder.decode(self._bytes[first - self.start :], final=self.over)

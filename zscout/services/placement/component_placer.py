@@ -33,8 +33,7 @@ PUBLISH_AT_ONCE: Final = 200  # components in one publication
 
 
 class ComponentPlacer:
-    """The placer of one term. `inherited` is its predecessor's, `maintained` the hosts in maintenance. Stop it after
-    `on_failure`."""
+    """`inherited`: its predecessor's placements; `maintained`: hosts in maintenance. Stop it after `on_failure`."""
 
     def __init__(
         self,

@@ -1,4 +1,4 @@
-"""A candidate's copy of the placer's publications: the only record of components on a host that died with the
+"""A candidate's copy of the placer's publications: all that is known of components on a host that died with the
 leader."""
 
 from __future__ import annotations

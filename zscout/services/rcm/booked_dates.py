@@ -115,8 +115,7 @@ class BookedDates:
         return time + self._dated_by
 
     def claim(self, date: Date, *, taken: bool = False) -> Booking:
-        """The core's booking for a date; if `taken`, it lapses only at its end. Raises ValueError for a malformed
-        record."""
+        """The core's booking for a date; if `taken`, it lapses only at its end. Raises ValueError if malformed."""
         record = date.record
         for need in record.needs:
             (check_maintained if record.maintenance else check_need)(need)
@@ -145,8 +144,7 @@ class BookedDates:
         return request if start is None else replace(request, not_before=self.local(start))
 
     def open_dates(self, record: BookingRecord, taken: Collection[str] = ()) -> list[Date]:
-        """The dates of a booking that are not over, of a repeated one for the next 60 days. `taken` dates do not
-        lapse."""
+        """Its dates that are not over; of a repeated booking for the next 60 days. `taken` dates do not lapse."""
         if record.unbooked:
             return []
         if not 0 < record.runtime <= MAX_AHEAD or (starts := self._starts(record)) is None:
@@ -209,8 +207,7 @@ class BookedDates:
         return found
 
     def parts(self) -> Iterator[Dates]:
-        """The dates of `recovered` in events of bounded size, sent before it; without lapsed ones that may turn out to
-        be taken up."""
+        """The dates of `recovered` in bounded events, sent before it; without lapsed ones that may prove taken."""
         part = list[Booking]()
         for record in list(self._records):
             known = self._expanded[record.id] = self._expand(record, ())

@@ -167,8 +167,8 @@ class BookingHandler:
             raise Refused("too_many", f"{MAX_CLAIMS} dates are booked, the most allowed; repeat it less often")
 
     def _check_share(self, record: BookingRecord, own: list[BookingRecord]) -> None:
-        """Raises Refused if the owner would have more than half of the fleet's bookings, or dates; cancelled ones count
-        to their end."""
+        """Raises Refused if the owner would have more than half of the fleet's bookings, or dates. A cancelled booking
+        counts until its last date is over."""
         if len(own) >= MAX_BOOKINGS // 2:
             words = f"{record.owner} has {len(own)} bookings, cancelled ones included, the most allowed"
             raise Refused("too_many", f"{words}; ask again when some are over")

@@ -233,8 +233,7 @@ class Bookings:
             self._once(_Due.DANGERS, DANGER_DELAY)
 
     def _report_dangers(self) -> None:
-        """Report changed dangers: once for all dates of a booking, the next dates first, as notices to people are
-        bounded."""
+        """Report changed dangers: once for all dates of a booking, next dates first, as notices are bounded."""
         before, self._reported = self._reported, self.dates.dangers()
         news = dict[tuple[str, str], list[Date]]()
         for name in before.keys() | self._reported.keys():
@@ -277,8 +276,7 @@ def oldest(answers: Iterable[BookingsKept]) -> tuple[float, Ns] | None:
 
 
 def _time(keeper: BookingKeeper, kept: Sequence[BookingsKept]) -> tuple[Ns, float]:
-    """Fleet time, and the seconds for which it has run: the oldest of any host; without any, the median of the clocks,
-    from now on."""
+    """Fleet time, and the seconds that it has run: the oldest of any host; else the median of the clocks, from now."""
     found = oldest([*kept, keeper.answer_to("", durable=False)])
     if found is not None:
         return found[1], found[0]

@@ -295,8 +295,7 @@ class Candidate:
         return heard
 
     async def _has_absurd_term(self, states: list[RcState]) -> bool:
-        """Return True if an RC with a token obeys a term that is absurd to other RCs, which must be asked to go above
-        it."""
+        """Return True if an RC with a token obeys a term absurd to other RCs: these must be asked to go above it."""
         highest = max(states, key=lambda state: state.term, default=None)
         if highest is None or not any(absurd(highest.term, state.term) for state in states):
             return False
@@ -443,8 +442,7 @@ class Candidate:
 
 
 def _refusal(reply: Reply[RcState] | Reply[ClientRequests], promise: Term) -> tuple[str, Term] | None:
-    """The key of an RC or client that does not promise this term, and the term that it obeys; None: it promises, or
-    names none."""
+    """The key of an RC or client that does not promise this term, and its term; None: it promises, or names none."""
     if reply.message is not None:
         return None if reply.message.term in (promise, NO_TERM) else (reply.key, reply.message.term)
     return None if reply.problem is None or reply.problem.term is None else (reply.key, reply.problem.term)

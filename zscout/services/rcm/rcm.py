@@ -206,8 +206,7 @@ class Rcm:
         self._run()
 
     def _concerns(self, query: IncomingQuery[messages.Operation]) -> tuple[Lane, str]:
-        """Dry runs and slots are questions; an operation on another host's request waits behind the surplus of that
-        host."""
+        """Dry runs and slots are questions; operations on another host's request wait behind its surplus."""
         operation, host = query.message, self.mesh.keys.sender_of(query.key).host
         if isinstance(operation, (messages.Foresee, messages.FindSlots)):
             return Lane.QUESTION, host

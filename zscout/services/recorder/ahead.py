@@ -75,8 +75,7 @@ def rows_of(bars: Iterable[Bar], now: float) -> int:
 
 
 def chart(bars: Iterable[Bar], now: float, ahead: Ahead, rows: int, *, stale: bool = False) -> dict[str, ChartLayer]:
-    """Layers by name. `rows`: of the tallest chart. `stale`: bookings are not received any more; `now` is the last
-    answer's time."""
+    """Layers by name. `rows`: of the tallest chart. `stale`: no bookings are received; `now`: the last answer."""
     within = _within(bars, now, ahead.seconds)
     names, seats = _seated(within)
     scale, high = (CHART_WIDTH - LEFT) / ahead.seconds, chart_row(rows)

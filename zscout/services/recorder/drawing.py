@@ -178,8 +178,8 @@ class Drawing:
 
 
 def unwritten(stream: rr.RecordingStream, path: Path, seconds: float) -> str:
-    """Why logged data is not in the file after `seconds`; or "". Rerun's writer ends at its first error, which only a
-    flush shows."""
+    """Why data is not in the file after `seconds`; or "". Rerun's writer ends at its first error: only a flush shows
+    it."""
     try:
         stream.flush(timeout_sec=seconds)
     except (RuntimeError, ValueError) as error:

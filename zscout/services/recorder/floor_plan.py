@@ -1,5 +1,4 @@
-"""The floor's part of the timeline: a building's plan with robots, people and trails, in pixels of the plan's
-picture."""
+"""The floor's part of the timeline: a building's plan with robots, people and trails, in pixels of its picture."""
 
 from __future__ import annotations
 
@@ -85,8 +84,7 @@ LAYERS: Final = {
 
 
 class Look(NamedTuple):
-    """The appearance of a robot: its activity, and its colour (RGBA), None for the colour of a hidden or visible
-    robot."""
+    """A robot's activity, and its colour (RGBA), None for the colour of a hidden or visible robot."""
 
     words: str = ""
     colour: int | None = None

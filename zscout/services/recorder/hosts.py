@@ -1,5 +1,4 @@
-"""The hosts' part of the timeline: load curves with marks, placements of components, and their resource use. Times are
-passed in."""
+"""The hosts' part of the timeline: loads with marks, placements of components, and their use. Times are passed in."""
 
 from __future__ import annotations
 
@@ -89,8 +88,7 @@ class HostTracker:
         self._cordoned: frozenset[str] = frozenset()
 
     def load(self, at: float, host: str, load1: float, cpu: float | None = None) -> None:
-        """A host's load average over 1 minute and, under `/cpu`, its CPU use (0 to 1); values that are not finite leave
-        a gap."""
+        """Load average over 1 minute and, under `/cpu`, CPU use (0 to 1); infinite or NaN values leave a gap."""
         entities = clean_path("load", host), clean_path("cpu", host)
         known = self._hosts.get(host)
         if known is None:

@@ -111,8 +111,7 @@ class Recorder:
         self._asking: asyncio.Task[None] | None = None
 
     async def run(self, stop: asyncio.Event) -> None:
-        """Record until `stop`, which a failure sets too; the token shows that an RCM's whole state was read. Raises
-        RecorderFailed."""
+        """Record until `stop`, which a failure sets too. Its token: an RCM's state was read. Raises RecorderFailed."""
         self._supervisor = Supervisor("the recorder", lambda _: stop.set())
         keys, subscribe, guard = self.mesh.keys, self.mesh.subscribe, self._supervisor.guard
         self._declared = [

@@ -281,8 +281,7 @@ class Timeline(Drawing):
             self.arrange()
 
     def close(self) -> None:
-        """End file and server within seconds; the file then opens on the whole run. Raises TimelineError if not all was
-        written."""
+        """End file and server within seconds; the file opens on the whole run. Raises TimelineError if incomplete."""
         if self.closed:
             return
         self.closed = True

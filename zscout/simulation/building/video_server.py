@@ -54,8 +54,7 @@ class StreamClient:
 
 
 class VideoServer:
-    """`channels`: path segments. `port` 0: any free port. Entering raises BadInput for an address that can't be
-    used."""
+    """`channels`: path segments. `port` 0: any free port. Entering raises BadInput for an unusable address."""
 
     def __init__(self, channels: Sequence[str], *, host: str = "127.0.0.1", port: int = 0) -> None:
         self._channels = {name: Channel(name) for name in channels}

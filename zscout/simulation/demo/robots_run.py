@@ -1,7 +1,6 @@
 """`zscout demo robots`: a building, three nodes with its devices, and a placed net.
 
-The demo observes publications only: of the RCM, of behaviors, and the simulated robots' true positions.
-"""
+The demo observes publications only: of the RCM, of behaviors, and robots' true positions."""
 
 from __future__ import annotations
 

@@ -93,8 +93,7 @@ class DemoRunner(ABC):
         )
 
     async def start_nodes(self, extra: Mapping[str, str], node_table: str = "") -> None:
-        """A node for each of HOSTS, on loopback. `extra`: text for a host's node file, `node_table` for its [node]
-        table."""
+        """A node for each of HOSTS, on loopback. `extra`: text for a host's node file; `node_table`: for [node]."""
         if not self._ends:
             self.write_fleet()
         for host, end in self._ends.items():

@@ -64,8 +64,8 @@ class DemoScreen:
         return [*([Text(self._where, overflow="fold")] if self._where else []), *lines]
 
     async def play(self, make: Callable[[Path], D], draw: Callable[[D], Group], out: Path | None) -> tuple[D, Path]:
-        """Run the demo that `make` returns for a temporary folder. Returns it and its recording, which is kept even if
-        the demo fails."""
+        """Run `make`'s demo in a temporary folder. Returns it and its recording, which is kept even if the demo
+        fails."""
         with _recording(out) as path, tempfile.TemporaryDirectory(prefix="zscout-demo-") as folder:
             demo = make(Path(folder))
             try:

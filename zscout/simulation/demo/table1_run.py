@@ -1,7 +1,6 @@
 """`zscout demo table1`: three nodes, the paper's five behaviors, and a process that watches.
 
-After the first request the watcher only subscribes: its queries to the RCM would be part of the picture.
-"""
+After the first request it only subscribes: its queries to the RCM would be part of the picture."""
 
 from __future__ import annotations
 
