@@ -43,12 +43,12 @@ RC. At 900665 a forger had reported a hold of whom the new leader had not heard,
 leader lost at once what it got there. At 3656 RCs of two hosts used up all terms; at 963496 RCs beside a liar were
 lost that had promised another candidate."""
 MISSED = {
-    "order": 1, "grant": 8, "safe first": 1, "snapshots": 8, "step down": 4, "reopen": 8, "places": 5,
+    "order": 1, "grant": 8, "safe first": 1, "snapshots": 15, "step down": 4, "reopen": 8, "places": 5,
     "withdrawn": 55, "believed": 70, "settling": 8, "deadline": 8, "once": 10, "sealed": 10, "copied": 3,
     "dates": 13, "merged": 3, "caught up": 4, "one stands": 33, "awaited": 3003, "had again": 33, "dates first": 113,
     "fleet time": 4, "late": 173, "steady": 3, "door": 5, "clamped": 85, "certified": 5, "managers": 5,
     "begun": 35, "begun heard": 35, "words": 6, "doubted": 46, "sealed terms": 56, "back": 76, "budget": 6,
-    "tolerated": 15, "unwell": 15, "denied": 900665,
+    "tolerated": 15, "unwell": 15,
 }  # fmt: skip
 """Guards without which some promise breaks within a few runs, and the seed of docs/promises/guards.md, tried first;
 `python -m studies faults --without` tries the others."""
@@ -94,17 +94,7 @@ def test_a_run_leaves_nothing_in_memory() -> None:
     assert left() == before
 
 
-COSTLY = (
-    "denied",
-    "doubted",
-    "sealed terms",
-    "back",
-    "snapshots",
-    "caught up",
-    "one stands",
-    "dates first",
-    "step down",
-)
+COSTLY = ("doubted", "sealed terms", "back", "snapshots", "caught up", "one stands", "dates first", "step down")
 
 
 @pytest.mark.parametrize(
