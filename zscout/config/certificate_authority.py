@@ -99,7 +99,7 @@ class CertificateAuthority:
 
     def issue(self, name: str, folder: Path, lasts: timedelta, now: datetime, *, manager: bool = False) -> datetime:
         """Write this name's folder, replacing its files; a manager's also gets the key that seals places. Returns the
-        end of the certificate, at the latest that of this CA. Raises BadInput."""
+        end of the certificate, at the latest this CA's. Raises BadInput."""
         check_name(name, Where("NAME"))
         if manager:
             if (places := read_places_key(self.folder)) is None:

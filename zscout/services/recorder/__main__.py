@@ -145,7 +145,7 @@ class _Files:
         prune(self._settings.path, self._fleet.name, limit=self._settings.limit * MEGABYTE)
 
     async def keep(self, recorder: Recorder, out: BinaryIO) -> None:
-        """Start another file after PART seconds, at MAX_PART bytes, or if this one can't be written (reported at once);
+        """Start another file after PART seconds, at MAX_PART bytes, or if this can't be written (reported at once);
         remove the oldest recordings. Does not return."""
         fault, due = "", time.monotonic() + CHECK_EVERY
         while True:

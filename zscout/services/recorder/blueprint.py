@@ -127,7 +127,7 @@ class Layout(msgspec.Struct, frozen=True):
 
 def blueprint(layout: Layout) -> rrb.Blueprint:
     """Lay out waiting requests, holders of devices and states of requests on one time axis, with events and loads
-    beside them; with components also those of each host and their use, with the loads below. Then empty panes of
+    beside them; with components also each host's components and their use, with the loads below. Then empty panes of
     devices or requests are left out. With robots, behaviors follow the requests, loads and hosts share a place, and
     floor and cameras are at the right, above the events."""
     span, robots, host_rows = layout.span, layout.robots, layout.host_rows
