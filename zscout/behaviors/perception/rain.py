@@ -62,6 +62,6 @@ class Rain:
         drop = float(np.median(area[fresh])) if places else 0.0
         moves = (lasts >= max(smallest, drop)) & (area >= LARGER * drop) | (area >= max(smallest, MUCH_LARGER * drop))
         moves[0] = False
-        moving = np.asarray(moves[labels], np.uint8)
+        moving = moves.astype(np.uint8).take(np.asarray(labels, np.int32))
         self.drops = regions - moving
         return moving
