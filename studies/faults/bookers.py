@@ -36,6 +36,9 @@ EPOCH: Final = 1_804_000_000.0
 """Seconds since 1970 at the beginning of a run: four weeks before a change to summer time."""
 SECONDS_OFF, HOURS_OFF, DRIFT = 3.0, (3_600.0, 20_000.0), 0.0005
 """Largest offset of a host's clock, its range in some runs (all in seconds), and the largest rate of its drift."""
+OUT_OF_DATE: Final = 60.0
+"""Seconds after a clock was set in which a leader may believe it as it was: a leader reads other hosts' clocks every
+30 s, and not while they are cut off."""
 SOON, FAR = (1, 12), (8_000, 12_000)
 """Seconds until the date of a booking. Far dates are beyond the hour for which components hold, as nearer dates would
 keep them from starting."""
@@ -84,6 +87,8 @@ class Hosts:
         self.disks = {host: MemoryDisk(SLOW if rng.random() < 0.15 else QUICK) for host in hosts}
         self.ahead = {host: rng.uniform(-SECONDS_OFF, SECONDS_OFF) for host in hosts}
         """Seconds by which each host's clock is ahead."""
+        self._set: dict[str, list[tuple[float, float]]] = {host: [] for host in hosts}
+        """When each host's clock was set, and by how many seconds it was ahead before."""
         self._drift = {host: rng.uniform(-DRIFT, DRIFT) for host in hosts}
         self._copies: dict[str, list[bytes]] = {}
         if booked and rng.random() < 0.4:
@@ -94,7 +99,20 @@ class Hosts:
 
     def wall(self, host: str) -> float:
         """The clock of a host, in seconds since 1970."""
-        return EPOCH + self._passed + (self._now() - START) * (1 + self._drift[host]) + self.ahead[host]
+        return self._wall(host, self.ahead[host])
+
+    def _wall(self, host: str, ahead: float) -> float:
+        return EPOCH + self._passed + (self._now() - START) * (1 + self._drift[host]) + ahead
+
+    def set_clock(self, host: str, by: float) -> None:
+        """Set the clock of a host `by` seconds ahead."""
+        self._set[host].append((self._now(), self.ahead[host]))
+        self.ahead[host] += by
+
+    def believed(self, host: str) -> list[float]:
+        """The clock of a host as a leader may believe it: now, and as if it had not been set lately."""
+        former = [ahead for at, ahead in self._set[host] if self._now() - at < OUT_OF_DATE]
+        return [self._wall(host, ahead) for ahead in (self.ahead[host], *former)]
 
     def pass_by(self, seconds: float) -> None:
         """Advance all clocks by a time in which no process ran."""

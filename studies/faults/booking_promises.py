@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import partial
@@ -86,8 +86,8 @@ class Fact:
 
 class BookingPromises:
     """`broken(text)` is called for each broken promise. `keepers`: of live processes, by host; `disks`: of all hosts;
-    `wall`: the clock of each host; `calm`: True without a present fault; `inside`: calls a function in the process of a
-    host's node."""
+    `believed`: the clock of each host as leaders may believe it; `calm`: True without a present fault; `inside`: calls
+    a function in the process of a host's node."""
 
     def __init__(
         self,
@@ -95,13 +95,13 @@ class BookingPromises:
         now: Callable[[], float],
         keepers: Mapping[str, BookingKeeper],
         disks: Mapping[str, Disk],
-        wall: Callable[[str], float],
+        believed: Callable[[str], Collection[float]],
         candidates: list[str],
         calm: Callable[[], bool],
         inside: Callable[[str, Callable[[], Any]], Any],
     ) -> None:
         self._broken, self.now, self._calm, self._inside = broken, now, calm, inside
-        self._keepers, self._disks, self._wall, self._candidates = keepers, disks, wall, candidates
+        self._keepers, self._disks, self._believed, self._candidates = keepers, disks, believed, candidates
         self.lives: dict[str, Life] = {}
         self.facts: dict[tuple[str, Instant | str], Fact] = {}
         self._destroyed = 0.0
@@ -315,7 +315,7 @@ class BookingPromises:
                 # It was corrected. Hosts that do not know that may lead meanwhile.
                 self._stepped = now
                 self._former.append(before)
-                nearest = min(abs(self._wall(host) - time) for host in self._disks)
+                nearest = min(abs(clock - time) for host in self._disks for clock in self._believed(host))
                 if abs(jump) < DIFFERS - AGREE or nearest > AGREE:
                     where = f"{jump:g} s in term {rcm.term.counter}, {nearest:g} s from the next clock"
                     self._broken(f"fleet time jumps by {where}")

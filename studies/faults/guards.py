@@ -5,7 +5,7 @@ Removing a guard changes a single decision, usually in one function, and leaves 
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from types import MappingProxyType
 from typing import Any, Final, NamedTuple
@@ -229,7 +229,7 @@ def _own_wall(keeper: BookingKeeper, _kept: Any) -> tuple[Ns, float]:
     return wall_ns(keeper.wall()), 0.0
 
 
-def _follow(self: FleetClock, walls: Mapping[str, Ns], now: Ns) -> Ns:
+def _follow(self: FleetClock, walls: Mapping[str, Ns], now: Ns, _kept: Collection[str] = ()) -> Ns:
     before = self.at(now)
     self.step(agreed(walls.values()), now)
     return self.at(now) - before

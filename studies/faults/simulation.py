@@ -311,7 +311,7 @@ class Simulation:
             lambda: loop.now,
             self.keepers,
             self.equipment.disks,
-            self.equipment.wall,
+            self.equipment.believed,
             self.candidates_at,
             lambda: not self.present,
             lambda host, call: self.running[f"{host}/node"][0].run(call),
@@ -748,7 +748,7 @@ class Simulation:
                 end = partial(self.equipment.fail, fault.whom, fails=False)
             case "clock":
                 for host in fault.whom:
-                    self.equipment.ahead[host] += fault.jump
+                    self.equipment.set_clock(host, fault.jump)
                 end = lambda: None  # noqa: E731
         self.present.append(fault)
         self._note_delays()
