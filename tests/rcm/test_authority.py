@@ -97,7 +97,7 @@ def test_who_is_in_several_groups_counts_in_the_first(tmp_path: Path) -> None:
         ("eve", ask("robot/arm1"), ""),
         ("bob", ask("robot/*"), ""),
         ("bob", ask("robot/scout1", keep=True), ""),
-        ("bob", ask("robot/scout1", min_runtime=61), "bob (client) may not request 61 s; at most 60; ada may"),
+        ("bob", ask("robot/scout1", min_runtime=61), "bob (client) may not request 61 s; at most 60 s; ada may"),
         ("eve", ask("a/1", "a/2", "a/3", "a/4"), TOO_MANY_RCS),
     ],
 )

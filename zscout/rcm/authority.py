@@ -80,7 +80,7 @@ class Authority:
         if most is not None and asked.priority > most:
             raise self._refused(name, f"request priority {asked.priority}; at most {most}")
         if longest and asked.min_runtime > longest:
-            raise self._refused(name, f"request {asked.min_runtime / SECOND:g} s; at most {longest / SECOND:g}")
+            raise self._refused(name, f"request {asked.min_runtime / SECOND:g} s; at most {longest / SECOND:g} s")
         for need in asked.needs:
             if not is_pattern(need) and not self.may_hold(name, need):
                 raise Refused(

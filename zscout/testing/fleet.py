@@ -52,7 +52,7 @@ class ComponentRun:
     async def checkpoint(self) -> bytes:
         """Hold the component at its next safe point, and return its state. Raises TimeoutError if it reaches none."""
         if not await self.gate.hold(SAFE_POINT_WITHIN):
-            raise TimeoutError(f"the component reached no safe point within {SAFE_POINT_WITHIN:g} s")
+            raise TimeoutError(f"no safe point within {SAFE_POINT_WITHIN:g} s; await context.safe_point() more often")
         try:
             return self.component.checkpoint()
         finally:

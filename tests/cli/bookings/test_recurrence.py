@@ -85,8 +85,8 @@ def test_a_count_is_of_all_dates_from_the_first_on(text: str, start: datetime) -
         ("FREQ=DAILY;INTERVAL=2000000000", "its INTERVAL or COUNT is not from 1 to 1000"),
         ("FREQ=DAILY;COUNT=1000000", "its INTERVAL or COUNT is not from 1 to 1000"),
         ("FREQ=DAILY,WEEKLY", "its rule has more than one FREQ"),
-        ("FREQ=DAILY;UNTIL=P1D", "its UNTIL is not a date"),
-        (f"FREQ=MONTHLY;BYMONTHDAY={'1,' * 200}1", "its rule is too long"),
+        ("FREQ=DAILY;UNTIL=P1D", "its UNTIL is not a date, such as 20261231"),
+        (f"FREQ=MONTHLY;BYMONTHDAY={'1,' * 200}1", "its rule lists more than 100 values in one part"),
     ],
 )
 def test_a_rule_that_is_not_followed_is_refused(text: str, why: str) -> None:

@@ -62,7 +62,7 @@ def parse_rule(parts: Mapping[str, Sequence[Any]]) -> RepeatRule:
     if odd := sorted(found.keys() - allowed - {"FREQ", "INTERVAL", "COUNT", "UNTIL"}):
         raise ValueError(f"its repetition {freq} with {', '.join(odd)} can't be booked")
     if any(len(values) > MAX_LISTED for values in found.values()):
-        raise ValueError("its rule is too long")
+        raise ValueError(f"its rule lists more than {MAX_LISTED} values in one part")
     interval, most = _single_value(found, "INTERVAL", 1), _single_value(found, "COUNT", None)
     if not 1 <= interval <= MAX_INTERVAL or (most is not None and not 1 <= most <= MAX_COUNT):
         raise ValueError(f"its INTERVAL or COUNT is not from 1 to {MAX_COUNT}")
@@ -79,7 +79,7 @@ def parse_rule(parts: Mapping[str, Sequence[Any]]) -> RepeatRule:
         DAYS_OF_WEEK.index(str(_single_value(found, "WKST", "MO"))),
     )
     if rule.until is not None and not isinstance(rule.until, date):
-        raise ValueError("its UNTIL is not a date")
+        raise ValueError("its UNTIL is not a date, such as 20261231")
     if freq == "WEEKLY" and any(which for which, _ in days):
         raise ValueError("it repeats WEEKLY on numbered days, which RFC 5545 forbids")
     if freq == "YEARLY" and (days or rule.by_monthday) and not rule.by_month:
