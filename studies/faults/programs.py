@@ -24,7 +24,7 @@ from zscout.types import SECOND, Place
 LONG: Final = 4
 STEALS_EVERY: Final = 0.5
 CLEARS_UP: Final = (0.0, 0.0, 0.2, 1.0, 60.0)
-"""Seconds that a program takes to end on request; with the last, it is killed before."""
+"""Seconds that a program takes to end on request. With the last value it is killed first."""
 
 
 class Program:

@@ -35,7 +35,7 @@ IN_AGREEMENT_WITHIN: Final = 1.5
 UNLED: Final = 0.5
 """Seconds beyond the hold lease after which an RC without a publishing RCM has no holder."""
 JUST_NOW: Final = 0.1
-"""Seconds: two looks."""
+"""Seconds that two looks of the checker take: a tolerance for events between them."""
 LEFT_OVER: Final = 7.0
 """Seconds after the last hold's end within which only its outcome is remembered."""
 

@@ -273,7 +273,7 @@ def _summed(field: Field, runs: Sequence[Outcomes]) -> FieldFigures:
 
 
 def _account(runs: Sequence[Outcomes]) -> tuple[CrossingsOf, list[CrossingsOf]]:
-    """Crossings of all runs together, and of each robot number with FEW or more over all runs."""
+    """Crossings of all runs together, and of each robot number that has FEW crossings or more in all runs."""
     whole, of_robots = CrossingsOf(), dict[int, CrossingsOf]()
     for run in runs:
         # By number, because buildings name their robots differently.

@@ -20,7 +20,7 @@ HAND_OVER_TIMEOUT: Final[Ns] = 30 * SECOND
 """After this both hosts are probed."""
 MAX_PROBES: Final = 3
 MAX_PATIENT_PROBES: Final = 15
-"""For a running source and a standby, which may still be busy; a standby ends itself after 30 s."""
+"""Unanswered probes of a running source or a standby, which may still be busy; a standby ends itself after 30 s."""
 RETRY: Final[Ns] = 5 * SECOND
 """Pause after a failed move off a drained host."""
 MOVES_PER_HOST: Final = 2

@@ -245,8 +245,8 @@ class RequestLog:
     def report(
         self, now: Ns, effects: Iterable[Effect], answered: Collection[ArcId], given_up: Collection[ArcId]
     ) -> list[Notice]:
-        """The notices of an instant's effects that no answer to an operation gave: not the grants of `answered` ARCs,
-        nor the ends of `given_up` ones."""
+        """Return the notices for the effects of an instant, without those that an answer to an operation carries:
+        grants of `answered` ARCs, and ends of `given_up` ARCs."""
         notices = []
         self.first_estimates.clear()
         for effect in effects:

@@ -356,7 +356,7 @@ class PatternClass:
     usable_of: int = -1
     short: bool = False
     choices: dict[int, object] = field(default_factory=dict)
-    """`patterns.Choices` that serve several members, by bits of the RCs reserved for others."""
+    """`patterns.Choices` that serve several members of the class, keyed by the bits of RCs reserved for other ARCs."""
     choices_of: tuple[int, int] = (-1, -1)  # versions of holders and demand
 
     def bound(self, arc: Arc) -> Mapping[Need, RcName]:

@@ -48,7 +48,8 @@ CLEARER: Final = 0.7
 """The first look restarts below this share of its noise: a camera's warm-up would hide motion for long."""
 OTHER: Final = 4.0
 OTHER_NOISE: Final = 2.0
-"""It also restarts if half of a picture is off by these grey levels and multiples of its noise: another scene."""
+"""The first look also restarts at another scene: half of the picture differs by this many grey levels and by this
+multiple of its noise."""
 ALIKE: Final = 1.2  # after a pause, the largest factor of a known picture's noise, up or down ...
 CHANGED: Final = 0.2  # ... and the largest share of it that changed.
 AGREE: Final = (0.15, 1.0)

@@ -18,7 +18,7 @@ from zscout.drivers.capture import FILE_RATE, FILE_RATES, MAX_PIXELS, MISSES, Ca
 
 OPEN_TIMEOUT_S: Final = 5.0
 READ_TIMEOUT_S: Final = 2.0
-"""For URLs."""
+"""Timeouts of sources that are URLs."""
 WAIT_S: Final = 0.2
 """Longest wait for one picture of a live source."""
 MIN_SIDE: Final = 8

@@ -43,9 +43,9 @@ from zscout.config.strict import BadInput, quoted
 from zscout.terminal import clean, clock, print_json, print_line, span
 
 ANSWER_TIMEOUT_S: Final = 10.0
-"""For an answer of the holder process."""
+"""The longest wait for an answer of the holder process."""
 RELEASE_TIMEOUT_S: Final = 60.0
-"""For the holder process to end the commands and release the devices."""
+"""The longest wait until the holder process has ended the commands and released the devices."""
 ABORT_TIMEOUT_S: Final = 10.0
 """For the end of a holder process that is no longer needed."""
 for_option: Final = click.option(

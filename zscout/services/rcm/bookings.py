@@ -29,9 +29,9 @@ from zscout.types import SECOND, HostName, Ns, span
 SLACK: Final[Ns] = SECOND // 100
 """Added to deadlines, as timers may be a little early."""
 BALLOTS_DELAY: Final[Ns] = SECOND // 500
-"""For gathering the ballots on a booking, one for each of its dates."""
+"""The time in which the ballots on a booking are gathered, one for each of its dates."""
 DATE_REFRESH_DELAY: Final[Ns] = SECOND
-"""For gathering changes before the next dates of repeated bookings are computed."""
+"""The time in which changes are gathered before the next dates of repeated bookings are computed."""
 DANGER_DELAY: Final[Ns] = 3 * SECOND
 """A danger is reported if it lasts for this time: after a change of leader, RCs join one after the other."""
 

@@ -251,7 +251,7 @@ class Rcm:
             self._running = False
 
     def _carry_out(self, out: steps.Outbox) -> bool:
-        """In the order of its fields. Return False if this leader stepped down."""
+        """Carry out the Outbox's fields in their order. Return False if this leader stepped down."""
         mesh, supervisor = self.mesh, self.supervisor
         self._answer(out.at_once)
         for word, token in out.higher:
