@@ -295,7 +295,8 @@ class RcmLink:
                 await self.leader_within(min(step, pause))
                 pause -= step
                 # A leader that publishes and is not visible may have ended a hold without notifying this client.
-                if self._last_contact > self._unseen_since if self.leader is None else unanswered:
+                publishes_unseen = self.leader is None and self._last_contact > self._unseen_since
+                if publishes_unseen or (unanswered and self.leader is not None):
                     break
             unanswered, known = False, self._changes
             for arc in self.store.open:
