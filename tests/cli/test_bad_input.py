@@ -89,7 +89,7 @@ run survey-000000000000 -- true | unknown token "survey-000000000000"
 run robot/a -- true | unknown token "robot/a"; robot/a is a device: zscout request robot/a -- COMMAND
 renew survey --for 1h | unknown token "survey"
 drive radio/rf0 | "radio/rf0" is not a robot; name one, as in robot/NAME
-drive robot/a --framegrabber radio/* | --framegrabber: "radio/*" is needed already, for another purpose; name another
+drive robot/a --framegrabber radio/* | --framegrabber: "radio/*" is needed already, as the radio; name another
 drive robot/a | standard input is not a terminal, and zscout drive reads keys; run it at a terminal
 drive robot/a --speed 9 | --speed: 9.0 is out of range; write 0.1 to 1.0
 motion --source none.avi | "none.avi" can't be read (No such file or directory); name a video file, a URL or a device

@@ -51,11 +51,10 @@ class SharedParams(Struct, kw_only=True):
                 if check_need(need).startswith(kind):
                     continue
             raise (PARAMS / name).bad(f"{quoted(need)} is not a {name}", f'name one, or a pattern, as in "{name}/*"')
-        if self.framegrabber in (self.radio, self.video):
-            other = "radio" if self.framegrabber == self.radio else "video channel"
-            what = f"{quoted(self.framegrabber)} is needed already, as the {other}"
-            raise (PARAMS / "framegrabber").bad(what, "name another device")
-        return RobotNeeds(robot, self.radio, self.video, self.framegrabber, self.command_rate)
+        needs = RobotNeeds(robot, self.radio, self.video, self.framegrabber, self.command_rate)
+        if fault := needs.shared_camera():
+            raise (PARAMS / "framegrabber").bad(fault, "name another device")
+        return needs
 
 
 class RobotParams(SharedParams):

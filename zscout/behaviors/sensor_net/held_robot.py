@@ -7,6 +7,7 @@ from typing import Any, Final
 
 from zscout.behaviors.client.arc import Held
 from zscout.behaviors.client.client import CommandRefused
+from zscout.config.strict import quoted
 from zscout.drivers.packets import MAX_PACKET
 from zscout.types import SECOND, Ns
 
@@ -23,6 +24,13 @@ class RobotNeeds:
     video: str = "video/*"
     framegrabber: str = "framegrabber/*"
     command_rate: float = 5.0  # most commands per second
+
+    def shared_camera(self) -> str:
+        """Return why the framegrabber can't be a need of its own, or an empty string."""
+        for purpose, need in (("radio", self.radio), ("video channel", self.video)):
+            if self.framegrabber == need:
+                return f"{quoted(need)} is needed already, as the {purpose}"
+        return ""
 
     def needs(self, *, video: str | None = None) -> dict[str, dict[str, Any]]:
         """For an ARC; `video` names another channel than usual."""

@@ -104,13 +104,14 @@ async def drive(
       zscout drive scout33 --stand-by --rate 10
       zscout drive robot/scout33 --pad /dev/input/js0 --record runs/scout33.rrd
     """
-    if framegrabber in (radio, video):
-        what = f"{quoted(framegrabber)} is needed already, for another purpose"
-        raise BadInput(f"--framegrabber: {what}; name another device")
+    from zscout.behaviors.sensor_net.held_robot import RobotNeeds
+
+    needs = RobotNeeds(robot, radio, video, framegrabber, rate)
+    if fault := needs.shared_camera():
+        raise BadInput(f"--framegrabber: {fault}; name another device")
     if not sys.stdin.isatty():
         raise BadInput("standard input is not a terminal, and zscout drive reads keys; run it at a terminal")
     common.check_recording("--record", record)
-    from zscout.behaviors.sensor_net.held_robot import RobotNeeds
     from zscout.behaviors.teleop import Pilot, Teleop
 
     fleet = common.the_fleet()
@@ -122,7 +123,6 @@ async def drive(
             hint = common.hint_at(robot, there, "and there are none on the mesh", "known")
             raise BadInput(f"unknown robot {quoted(robot)}{hint}")
         pilot, end = Pilot(speed), asyncio.Event()
-        needs = RobotNeeds(robot, radio, video, framegrabber, rate)
         console = stack.enter_context(_Console(robot, as_json=as_json))
         teleop = Teleop(client, needs, pilot, priority=fleet.operator_priority, changed=lambda: console.update(teleop))
         hands = Hands(teleop, end)
