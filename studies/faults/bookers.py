@@ -36,9 +36,6 @@ EPOCH: Final = 1_804_000_000.0
 """Seconds since 1970 at the beginning of a run: four weeks before a change to summer time."""
 SECONDS_OFF, HOURS_OFF, DRIFT = 3.0, (3_600.0, 20_000.0), 0.0005
 """Largest offset of a host's clock, its range in some runs (all in seconds), and the largest rate of its drift."""
-OUT_OF_DATE: Final = 60.0
-"""Seconds after a clock was set in which a leader may believe it as it was: a leader reads other hosts' clocks every
-30 s, and not while they are cut off."""
 SOON, FAR = (1, 12), (8_000, 12_000)
 """Seconds until the date of a booking. Far dates are beyond the hour for which components hold, as nearer dates would
 keep them from starting."""
@@ -109,9 +106,9 @@ class Hosts:
         self._set[host].append((self._now(), self.ahead[host]))
         self.ahead[host] += by
 
-    def believed(self, host: str) -> list[float]:
-        """The clock of a host as a leader may believe it: now, and as if it had not been set lately."""
-        former = [ahead for at, ahead in self._set[host] if self._now() - at < OUT_OF_DATE]
+    def believed(self, host: str, within: float) -> list[float]:
+        """The clock of a host: now, and as if it had not been set in the last `within` seconds."""
+        former = [ahead for at, ahead in self._set[host] if self._now() - at < within]
         return [self._wall(host, ahead) for ahead in (self.ahead[host], *former)]
 
     def pass_by(self, seconds: float) -> None:

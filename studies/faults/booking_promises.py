@@ -29,6 +29,9 @@ if TYPE_CHECKING:
 
 RUNS_APART: Final = 0.0011
 """Largest rate by which fleet time may run faster or slower than virtual time, on an inexact clock."""
+OUT_OF_DATE: Final = 60.0
+"""Seconds after a clock was set in which a leader may believe it as it was: a leader reads other hosts' clocks every
+30 s, and not while they are cut off."""
 AGREE: Final = 0.5
 """Seconds by which a new leader's fleet time may differ from the fleet time that it continues."""
 AT_ITS_DATE: Final = 1.5
@@ -86,8 +89,8 @@ class Fact:
 
 class BookingPromises:
     """`broken(text)` is called for each broken promise. `keepers`: of live processes, by host; `disks`: of all hosts;
-    `believed`: the clock of each host as leaders may believe it; `calm`: True without a present fault; `inside`: calls
-    a function in the process of a host's node."""
+    `believed(host, within)`: a host's clock as leaders may believe it that last read it less than `within` seconds ago;
+    `calm`: True without a present fault; `inside`: calls a function in the process of a host's node."""
 
     def __init__(
         self,
@@ -95,7 +98,7 @@ class BookingPromises:
         now: Callable[[], float],
         keepers: Mapping[str, BookingKeeper],
         disks: Mapping[str, Disk],
-        believed: Callable[[str], Collection[float]],
+        believed: Callable[[str, float], Collection[float]],
         candidates: list[str],
         calm: Callable[[], bool],
         inside: Callable[[str, Callable[[], Any]], Any],
@@ -315,10 +318,12 @@ class BookingPromises:
                 # It was corrected. Hosts that do not know that may lead meanwhile.
                 self._stepped = now
                 self._former.append(before)
-                nearest = min(abs(clock - time) for host in self._disks for clock in self._believed(host))
+                nearest = min(abs(clock - time) for host in self._disks for clock in self._believed(host, OUT_OF_DATE))
+                where = f"{jump:g} s in term {rcm.term.counter}, {nearest:g} s from the next clock"
                 if abs(jump) < DIFFERS - AGREE or nearest > AGREE:
-                    where = f"{jump:g} s in term {rcm.term.counter}, {nearest:g} s from the next clock"
                     self._broken(f"fleet time jumps by {where}")
+                elif not self._may_be_median(time, rcm.bookings.clock.hosts):
+                    self._broken(f"fleet time jumps to a minority's clock, by {where}")
         elif before is not None or self._heard.get(host, rcm.term) != rcm.term:  # own term: it published and stopped
             if before is not None:
                 # Its time began apart from the other hosts, and it has met them now. Hosts that received only its time
@@ -329,6 +334,14 @@ class BookingPromises:
             if not (any(map(current.agrees, known)) and any(map(current.continues, known))):
                 self._broken(f"fleet time is {time:.3f} in term {rcm.term.counter}: it continues no earlier fleet time")
         self._times[rcm.term] = current
+
+    def _may_be_median(self, time: float, hosts: Collection[str]) -> bool:
+        """Return True if half of the clocks of `hosts` may be at or before `time`, and half at or after it. A leader
+        may have read the clock of a silent host before it was set."""
+        clocks = [self._believed(host, math.inf) for host in hosts]
+        before = sum(min(times) <= time + AGREE for times in clocks)
+        after = sum(max(times) >= time - AGREE for times in clocks)
+        return 2 * min(before, after) >= len(clocks)
 
     def _look_at_grants(self, host: str, rcm: Rcm) -> None:
         """Check that no ARC starts that would overlap the date of a known booking of its rank or above."""

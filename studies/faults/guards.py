@@ -5,7 +5,7 @@ Removing a guard changes a single decision, usually in one function, and leaves 
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from types import MappingProxyType
 from typing import Any, Final, NamedTuple
@@ -40,7 +40,7 @@ from zscout.rcm.terms import BELIEVED, Terms, Verdict
 from zscout.scheduling.calendar import Calendar
 from zscout.scheduling.model import Arc, ArcRequest
 from zscout.scheduling.state import SchedulerState
-from zscout.services.bookings import records
+from zscout.services.bookings import fleet_clock, records
 from zscout.services.bookings.fleet_clock import FleetClock, agreed, wall_ns
 from zscout.services.bookings.keeper import BookingKeeper
 from zscout.services.rcm import bookings, candidate
@@ -235,6 +235,10 @@ def _follow(self: FleetClock, walls: Mapping[str, Ns], now: Ns, _kept: Collectio
     return self.at(now) - before
 
 
+def _fastest(times: Iterable[Ns], _current: Ns | None = None, _kept: Collection[Ns] = ()) -> Ns:
+    return max(times)
+
+
 def _no_obstacle(*_: object) -> tuple[None, list[Any]]:
     return None, []
 
@@ -361,6 +365,7 @@ GUARDS: Final[Mapping[str, Guard]] = MappingProxyType(
             "fleet time moves only where most clocks differ from it by more than 2 s",
             {(FleetClock, "correct"): _follow},
         ),
+        "most clocks": Guard("fleet time moves to the time of most clocks", {(fleet_clock, "agreed"): _fastest}),
         "dates first": Guard(
             "a leader knows of all dates before it grants",
             {(Bookings, "recovered"): _none_recovered, (Rcm, "enter"): _do_nothing},

@@ -57,6 +57,11 @@ class FleetClock:
         """The offset on which most clocks agree instead, and since when."""
         self.step(time, now)
 
+    @property
+    def hosts(self) -> Collection[HostName]:
+        """Hosts whose clocks count."""
+        return self._hosts.keys()
+
     def at(self, now: Ns) -> Ns:
         """Fleet time, in ns since 1970 (UTC)."""
         return now + self._offset
