@@ -108,7 +108,8 @@ def test_what_is_free_is_taken_without_a_question(fleet: CliFleet) -> None:
 def test_who_shares_may_stay_and_equals_are_waited_for(fleet: CliFleet) -> None:
     sharer = fleet.holder("sharer", "radio/rf0:rate=4")
     peer = fleet.holder("peer", "robot/b", "--priority", "10")
-    done = fleet.zscout("take", "radio/rf0:rate=4", "robot/b", "robot/x", "--yes", "--timeout", "0.2", "--json")
+    wanted = ("radio/rf0:rate=4", "robot/b", "robot/x", "--wait-for-device")
+    done = fleet.zscout("take", *wanted, "--yes", "--timeout", "0.2", "--json")
     assert events(done.stdout), done.stderr
     preview = events(done.stdout)[0]
     assert preview["preempts"] == []

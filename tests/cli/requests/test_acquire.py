@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import signal
+import socket
 import stat
 import subprocess
 import time
@@ -17,6 +18,7 @@ import pytest
 from tests.cli.cli_fleet import CliFleet, fleet_of
 from tests.cli.tools import COMMAND, end, events, gone, out_of, read_until
 from tests.hang import HANG
+from zscout.cli.requests import token_files
 
 pytestmark = pytest.mark.live
 
@@ -110,6 +112,19 @@ def test_the_json_of_acquire_has_the_token_and_the_hold(fleet: CliFleet) -> None
     assert fleet.zscout("release", told["token"], "--json").returncode == 0
     kinds = [event["event"] for event in events(path.read_text())]
     assert [kind for kind in kinds if kind != "waits"] == ["granted", "ended"]
+
+
+def test_a_token_can_be_used_as_soon_as_it_is_told(fleet: CliFleet) -> None:
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    command = [*COMMAND, "acquire", "robot/a", "--for", "1h", "--starter", str(theirs.fileno())]
+    # The sockets are closed first, which ends the process.
+    with subprocess.Popen(command, env=fleet.lab.env, pass_fds=(theirs.fileno(),)) as holder, ours, theirs:
+        token = json.loads(ours.recv(1 << 16))["token"]
+        (path,) = [path for path in files(fleet) if path.stem == token]
+        user = token_files.connect(path)
+        assert user is not None
+        user.close()
+    assert holder.returncode == 0
 
 
 def test_what_cannot_be_acquired_has_the_codes_of_request(fleet: CliFleet) -> None:

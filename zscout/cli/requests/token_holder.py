@@ -88,11 +88,17 @@ class TokenHolder:
         if self._direct is not None:
             self._direct.watch(self._follow)
 
+    def serve(self, path: Path) -> None:
+        """Serve the commands that use the token of this file, until `close`. Raises Failed."""
+        try:
+            self._server = token_files.listen(path)
+        except OSError as error:
+            raise Failed(f"the token's socket can't be opened: {error}") from None
+        asyncio.get_running_loop().add_reader(self._server, self._accept, self._server)
+
     async def until_over(self, path: Path, followed: int | None) -> TokenEnding:
-        """Serve the token of this file until the hold is over. followed: pidfd of a process whose end ends the hold."""
-        server = token_files.listen(path)
+        """Wait until the hold of this file's token is over. followed: pidfd of a process whose end ends the hold."""
         loop = asyncio.get_running_loop()
-        loop.add_reader(server, self._accept, server)
         if followed is not None:
             loop.add_reader(followed, self._end, TokenEnding("the process that it follows has ended"))
         try:
@@ -102,8 +108,6 @@ class TokenHolder:
                     await asyncio.wait((self._ending,), timeout=max(0.0, min(left, CHECK_FILE_INTERVAL_S)))
                 return self._ending.result()
         finally:
-            # `close` ends the server, after the file has the reason for the end.
-            self._server = server
             if followed is not None:
                 loop.remove_reader(followed)
 
@@ -137,7 +141,7 @@ class TokenHolder:
         return bool(self._releasing)
 
     def close(self, *, gave_back: bool) -> None:
-        """Answer the processes that released the token, and stop serving it."""
+        """Answer the processes that released the token, and stop serving it: the file has the reason for the end."""
         if self._server is not None:
             asyncio.get_running_loop().remove_reader(self._server)
             self._server.close()
@@ -266,6 +270,8 @@ async def hold(client: Client, wanted: HoldOptions, seconds: float, follow: int 
         try:
             token = f"{arc.name}-{new_instance()}"
             path, content = _new_file(token, client, held)
+            # Whoever gets the token may use it at once.
+            holder.serve(path)
             starter.send(TokenGranted(token, text, {"arc": arc.name, "client": str(client.mesh.me)} | details))
             if await starter.receive(ToHolder) is None:
                 ending = TokenEnding("the token was not printed")
