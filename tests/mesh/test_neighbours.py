@@ -3,19 +3,25 @@
 from __future__ import annotations
 
 import asyncio
+import json
+import re
 import socket
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor, wait
+from functools import partial
 from types import SimpleNamespace
 
 import pytest
 from msgspec.structs import replace
 
+from tests.hang import HANG
 from tests.mesh.kit import until
 from zscout.config.fleet import Fleet, MeshConfig, beside, default_fleet
 from zscout.keyexpr import Sender, new_instance
 from zscout.mesh import ZenohMesh, neighbours
 from zscout.mesh.neighbours import MAX_NEIGHBOURS, Meeting
+from zscout.mesh.zenoh_mesh import zenoh_config
 
 pytestmark = [pytest.mark.real_time, pytest.mark.skipif(sys.platform != "linux", reason="abstract sockets are Linux's")]
 
@@ -50,6 +56,50 @@ async def test_two_that_begin_at_one_time_meet(fleet: Fleet) -> None:
     await until(lambda: all(mesh.links() == 1 for mesh in both))
     for mesh in both:
         await mesh.close()
+
+
+@pytest.mark.slow
+async def test_sessions_of_one_moment_are_linked_by_loopback(fleet: Fleet) -> None:
+    """As those of a node and its programs, which all reopen theirs when their host has a new address."""
+    wide = replace(fleet, mesh=MeshConfig())
+    for _ in range(4):
+        opened = await asyncio.gather(*(ZenohMesh.open(wide, Sender("a", name)) for name in "wxyz"))
+        await until(partial(_all_linked_by_loopback, opened))
+        for mesh in opened:
+            await mesh.close()
+
+
+def _all_linked_by_loopback(opened: Sequence[ZenohMesh]) -> bool:
+    links = [link for mesh in opened for link in mesh._transport.current._session.info.links()]  # type: ignore[attr-defined]
+    ends = [re.fullmatch(r"tcp/(?:127\.0\.0\.1|\[::1\]|\[::ffff:127\.0\.0\.1\]):\d+", link.dst) for link in links]
+    return all(ends) and len(ends) == len(opened) * (len(opened) - 1)
+
+
+def test_the_session_that_makes_the_links_has_the_greater_id(fleet: Fleet) -> None:
+    older, newer = (Meeting(fleet.name, fleet.mesh, "tcp") for _ in range(2))
+    ids = [json.loads(zenoh_config(fleet.mesh, None, met).get_json("id")) for met in (newer, older)]
+    older.close()
+    newer.close()
+    # Zenoh compares from the last byte on.
+    assert bytes.fromhex(ids[0])[::-1] > bytes.fromhex(ids[1])[::-1]
+
+
+def test_a_new_session_waits_until_a_neighbour_of_the_same_moment_listens(
+    fleet: Fleet, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(neighbours, "LISTEN_TIMEOUT_S", HANG)
+    older = Meeting(fleet.name, fleet.mesh, "tcp")
+    newer = Meeting(fleet.name, fleet.mesh, "tcp")
+    with socket.socket() as zenohs, ThreadPoolExecutor(1) as pool:
+        zenohs.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        zenohs.bind(("127.0.0.1", int(older.endpoint.rpartition(":")[2])))
+        waiting = pool.submit(newer.wait_for_others)
+        assert not wait([waiting], timeout=3 * neighbours.POLL_S).done
+        zenohs.listen()
+        waiting.result()
+        assert older.endpoint in newer.others[0]
+    older.close()
+    newer.close()
 
 
 async def test_other_meshes_are_no_neighbours(fleet: Fleet) -> None:

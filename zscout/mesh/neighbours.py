@@ -2,31 +2,59 @@
 
 Each session listens on loopback, and publishes its port in the name of an abstract Linux socket. The kernel lists these
 names, removes them with their process, and keeps them apart for each network namespace, as it does loopback. A new
-session connects to the sessions that it finds. Like an answer to multicast, a name grants no rights: it only gives an
-address."""
+session connects to the sessions that it finds. Where multicast was first, and linked the two by a network address, the
+new session ends that link: it would end with the address. Like an answer to multicast, a name grants no rights: it only
+gives an address."""
 
 from __future__ import annotations
 
 import hashlib
+import ipaddress
+import os
 import re
 import socket
+import stat
 import time
+from collections.abc import Callable, Collection, Iterable, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Final
+from typing import Any, Final, Protocol, TypeAlias
 
 from zscout.config.fleet import MeshConfig
+from zscout.types import SECOND
 
 MAX_NEIGHBOURS: Final = 64
 """A new session connects to at most this many sessions, the oldest first, so to nodes. Multicast finds the others."""
+LISTEN_TIMEOUT_S: Final = 0.5
+RELINK_TIMEOUT_S: Final = 0.5
+POLL_S: Final = 0.005
+YOUNG: Final = 2 * SECOND
+"""A neighbour that was opened so long ago listens, or its process hangs."""
 _NAMES: Final = Path("/proc/net/unix")
+_LISTENERS: Final = Path("/proc/net/tcp")
+_LISTENS: Final = re.compile(r"^ *\d+: 0100007F:([0-9A-F]{4}) \S+ 0A ", re.MULTILINE)
+_LOCATOR: Final = re.compile(r"[a-z]+/\[?(?P<ip>[0-9a-f.:]+)\]?:(?P<port>[0-9]+)")
 _RETRY: Final = "#retry_period_init_ms=50;retry_period_max_ms=5000;retry_period_increase_factor=2"
 """Retry seldom: Zenoh tries to reach an ended neighbour as long as this session lives."""
+
+_Address: TypeAlias = tuple[str, int]
+
+
+class Link(Protocol):
+    """A link of a session, by the endpoints of both ends."""
+
+    @property
+    def src(self) -> object: ...
+
+    @property
+    def dst(self) -> object: ...
 
 
 class Meeting:
     """Reserves and publishes the loopback port of one session of a fleet until it is closed, and lists the endpoints of
-    its neighbours in `others`. Raises OSError if the sockets can't be made."""
+    its neighbours in `others`. Raises OSError if the sockets can't be made.
+
+    `at`: when it was published, in ns since 1970. Of two sessions the one with the later time makes the link."""
 
     def __init__(self, fleet: str, mesh: MeshConfig, protocol: str) -> None:
         meeting = hashlib.sha256(" ".join([fleet, *mesh.known_by]).encode()).hexdigest()[:16]
@@ -36,14 +64,39 @@ class Meeting:
             # Reserves the port for Zenoh, which may bind it too, until this socket is closed.
             self._reserved.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             self._reserved.bind(("127.0.0.1", 0))
-            port, at = self._reserved.getsockname()[1], time.time_ns()
+            port, self.at = self._reserved.getsockname()[1], time.time_ns()
             self.endpoint = f"{protocol}/127.0.0.1:{port}"
             # Publish before listing: of two sessions that start together at least one finds the other.
-            self._published.bind(f"\0zscout-mesh-{meeting}-{protocol}-{port}-{at}")
-            self.others = _others(meeting, protocol, at)
+            self._published.bind(f"\0zscout-mesh-{meeting}-{protocol}-{port}-{self.at}")
+            older = _older(meeting, protocol, self.at)
+            self.others = [f"{protocol}/127.0.0.1:{port}{_RETRY}" for _, port in older]
+            self._young = {port for at, port in older if self.at - at < YOUNG}
         except OSError:
             self.close()
             raise
+
+    def wait_for_others(self) -> None:
+        """Wait until the neighbours listen that were opened at about the same time. Blocks LISTEN_TIMEOUT_S at most."""
+        tries = round(LISTEN_TIMEOUT_S / POLL_S)
+        while tries and not self._young <= _listening():
+            tries -= 1
+            time.sleep(POLL_S)
+
+    def relink(self, links: Callable[[], Iterable[Link]]) -> None:
+        """End the links of a new session by network addresses of this host, if neighbours have no link by loopback:
+        Zenoh tries these again soon, and has nothing to lose yet. Blocks RELINK_TIMEOUT_S at most."""
+        others = {endpoint.partition("#")[0] for endpoint in self.others}
+        # Those of the same moment may not be linked yet.
+        wanted = len(others) if self._young else 0
+        for _ in range(round(RELINK_TIMEOUT_S / POLL_S)):
+            found = [link for link in links() if _is_local(link)]
+            outside = [ends for ends in map(_ends, found) if not ipaddress.ip_address(ends[0][0]).is_loopback]
+            if outside and not others <= {str(link.dst) for link in found}:
+                wanted = max(wanted, len(found))
+                _shut(outside)
+            elif len(found) >= wanted:
+                return
+            time.sleep(POLL_S)
 
     def release_port(self) -> None:
         """Close the reserving socket: Zenoh listens on the port now."""
@@ -54,11 +107,48 @@ class Meeting:
         self._published.close()
 
 
-def _others(meeting: str, protocol: str, before: int) -> list[str]:
-    """Endpoints of older neighbours, the oldest first: of two sessions the newer one makes the link."""
+def _older(meeting: str, protocol: str, before: int) -> list[tuple[int, int]]:
+    """Times and ports of older neighbours, the oldest first: of two sessions the newer one makes the link."""
     name = re.compile(rf"@zscout-mesh-{meeting}-{protocol}-(\d{{1,5}})-(\d{{1,20}})$", re.ASCII | re.MULTILINE)
-    found = list[tuple[int, str]]()
+    found = list[tuple[int, int]]()
     with suppress(OSError):
-        found = [(int(at), port) for port, at in name.findall(_NAMES.read_text(errors="replace"))]
-    older = sorted((at, port) for at, port in found if at < before and 0 < int(port) < 65_536)
-    return [f"{protocol}/127.0.0.1:{port}{_RETRY}" for _, port in older[:MAX_NEIGHBOURS]]
+        found = [(int(at), int(port)) for port, at in name.findall(_NAMES.read_text(errors="replace"))]
+    return sorted((at, port) for at, port in found if at < before and 0 < port < 65_536)[:MAX_NEIGHBOURS]
+
+
+def _ends(link: Link) -> tuple[_Address, _Address]:
+    """Addresses and ports of both ends; empty for links other than TCP and TLS."""
+    found = [_LOCATOR.fullmatch(str(end)) for end in (link.src, link.dst)]
+    here, there = [_plain((end["ip"], int(end["port"]))) if end is not None else ("", 0) for end in found]
+    return here, there
+
+
+def _plain(address: Sequence[Any]) -> _Address:
+    """An address of `socket` without scope, and without the form of IPv4 addresses that IPv6 sockets have."""
+    return str(address[0]).removeprefix("::ffff:"), int(address[1])
+
+
+def _is_local(link: Link) -> bool:
+    """Return True for a link within this host."""
+    (here, _), (there, _) = _ends(link)
+    return here == there != ""
+
+
+def _shut(links: Collection[tuple[_Address, _Address]]) -> None:
+    """Shut down the sockets of this process with these ends: Zenoh can't end a single link."""
+    for fd in Path("/proc/self/fd").iterdir():
+        with suppress(OSError):
+            if not stat.S_ISSOCK(fd.stat().st_mode):
+                continue
+            # A copy: the descriptor may be closed meanwhile, and its number be given to another file.
+            with socket.socket(fileno=os.dup(int(fd.name))) as one:
+                inet = one.family in (socket.AF_INET, socket.AF_INET6)
+                if inet and (_plain(one.getsockname()), _plain(one.getpeername())) in links:
+                    one.shutdown(socket.SHUT_RDWR)
+
+
+def _listening() -> set[int]:
+    """Ports of loopback on which processes of this host listen."""
+    with suppress(OSError):
+        return {int(port, 16) for port in _LISTENS.findall(_LISTENERS.read_text(errors="replace"))}
+    return set()

@@ -81,7 +81,7 @@ def zenoh_config(config: MeshConfig, security: Security | None = None, meeting: 
     v6_group = config.multicast_address.startswith("[")
     settings: dict[str, Any] = {
         "mode": "router" if config.relay else "peer",
-        "id": increasing_id(),
+        "id": increasing_id(None if meeting is None else meeting.at),
         "scouting/multicast/enabled": config.multicast,
         "scouting/multicast/address": config.multicast_address,
         "scouting/multicast/interface": config.interface if v6_group else interfaces.scouting(config.interface, found),
@@ -277,10 +277,11 @@ def _security(fleet: Fleet, keys: Keys, me: Sender) -> Security:
     return Security(own, keys, tuple(fleet.access.members()))
 
 
-def increasing_id() -> str:
-    """A session id greater than all earlier ones, so that the newer session makes the links. Zenoh compares ids from
-    the last byte on, and prints them as a number."""
-    return f"1{secrets.token_hex(9)}0{time.time_ns().to_bytes(8, 'little').hex()[4:]}"
+def increasing_id(at: int | None = None) -> str:
+    """A session id greater than all earlier ones, so that the newer session makes the links. `at`: its time, in ns
+    since 1970; None: now. Zenoh compares ids from the last byte on, and prints them as a number."""
+    time_ns = time.time_ns() if at is None else at
+    return f"1{secrets.token_hex(9)}0{time_ns.to_bytes(8, 'little').hex()[4:]}"
 
 
 def check_room(files: int = SESSION_FILES, threads: int = SESSION_THREADS) -> None:
@@ -330,7 +331,16 @@ async def _open(fleet: str, config: MeshConfig, security: Security | None) -> Tr
     if config.known_by and not config.relay:
         with suppress(OSError):  # without it multicast and `connect` find the neighbours
             met = Meeting(fleet, config, "tcp" if security is None else "tls")
-    opening = in_thread("joins the mesh", lambda: open_session(lambda: zenoh_config(config, security, met)))
+
+    def join() -> zenoh.Session:
+        if met is not None:
+            met.wait_for_others()
+        opened = open_session(lambda: zenoh_config(config, security, met))
+        if met is not None:
+            met.relink(opened.info.links)
+        return opened
+
+    opening = in_thread("joins the mesh", join)
     try:
         session = await asyncio.wrap_future(opening)
     except BaseException:
