@@ -6,6 +6,7 @@ import asyncio
 import socket
 import threading
 import time
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -23,6 +24,7 @@ class StuckSession:
     """A Zenoh session that never closes."""
 
     def __init__(self) -> None:
+        self.info = SimpleNamespace(links=list)
         self.closing = threading.Event()
         self.released = threading.Event()
 

@@ -337,7 +337,11 @@ async def _open(fleet: str, config: MeshConfig, security: Security | None) -> Tr
             met.wait_for_others()
         opened = open_session(lambda: zenoh_config(config, security, met))
         if met is not None:
-            met.relink(opened.info.links)
+            try:
+                met.relink(opened.info.links)
+            except BaseException:
+                opened.close()  # type: ignore[no-untyped-call]
+                raise
         return opened
 
     opening = in_thread("joins the mesh", join)
