@@ -1,4 +1,5 @@
-"""A host whose network comes late: its programs find the node beside them, and the fleet is whole once it is there."""
+"""Interfaces and addresses come and go, or come late: the fleet is whole again by itself, and programs beside the
+leader keep their holds."""
 
 from __future__ import annotations
 
@@ -8,7 +9,7 @@ from typing import Final
 import pytest
 
 from studies.chaos.net import NoNamespaces, check
-from studies.interfaces import Fleet, Way, cycle
+from studies.interfaces import CHANGES, Fleet, Way, cycle
 
 pytestmark = [pytest.mark.live, pytest.mark.slow]
 WITHIN: Final = 10.0
@@ -25,10 +26,10 @@ def _namespaces() -> None:
 
 @pytest.mark.parametrize("secured", [False, True], ids=["plain", "secured"])
 @pytest.mark.parametrize("way", ["multicast", "connect"])
-async def test_a_host_that_begins_before_its_network_works_alone_and_joins_by_itself(
-    tmp_path: Path, way: Way, secured: bool
-) -> None:
+async def test_a_fleet_follows_the_network_of_its_leader(tmp_path: Path, way: Way, secured: bool) -> None:
     async with Fleet(tmp_path, way, secured=secured) as fleet:
-        found = await cycle(fleet, "cable")
-        assert found.took < WITHIN, found
-        assert not found.needless, found
+        await fleet.whole({"cam/a", "cam/b"})
+        for change in CHANGES:
+            found = await cycle(fleet, change)
+            assert found.took < WITHIN, found
+            assert not found.needless, found
