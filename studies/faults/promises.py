@@ -12,6 +12,7 @@ from itertools import chain, product
 from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 from zscout.drivers.instances import InstanceState
+from zscout.messages import absurd
 from zscout.scheduling.model import ArcStatus
 from zscout.scheduling.reason import ReasonCode
 from zscout.types import NO_TERM, SECOND, ArcId, Grant, Ns, Place, Term
@@ -412,5 +413,7 @@ def _worse_places(clients: Mapping[str, Client], leaders: Mapping[str, Rcm]) -> 
         for arc in client._store.acknowledged:
             for rcm in leaders.values():
                 known = rcm.core.arc(f"{name}/{arc.id}")
+                if absurd(rcm.term, client.internals.term):
+                    continue  # the client does not ask this leader yet
                 if known is not None and arc._place is not None and known.place > arc._place:
                     yield name, arc.name, "is at a worse place than its client knows, in", rcm.term

@@ -16,9 +16,11 @@ from zscout.behaviors.client.arc import hold
 from zscout.behaviors.client.client import Client
 from zscout.behaviors.client.confirmation import CONFIRM_TIMEOUT
 from zscout.behaviors.client.internals import NOTICE_TIMEOUT, REJOIN_TIMEOUT
+from zscout.behaviors.client.rcm_link import RcmLink
 from zscout.behaviors.client.request import CommandRefused
-from zscout.keyexpr import Role
-from zscout.messages import Command
+from zscout.keyexpr import Role, Token
+from zscout.mesh import Reply
+from zscout.messages import Command, Notice, Operation
 from zscout.scheduling.model import HOLD_BACK
 from zscout.testing.link import Disturbance
 from zscout.types import SECOND
@@ -146,6 +148,25 @@ async def test_a_holder_that_does_not_see_the_leader_it_receives_soon_asks_it() 
         await until(lambda: one.leader is None)
         await until(lambda: not fleet.rcs[0].holds.held, within=2.0)
         await until(lambda: arc.grant != grant, within=1.5)
+
+
+async def test_an_answer_in_an_absurd_term_counts_as_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Simulator, seed 318605: after a forged term a client asked its leader only seconds after it had accepted it."""
+    asked = 0
+
+    async def counted(link: RcmLink, operation: Operation) -> Reply[Notice] | None:
+        nonlocal asked
+        asked += 1
+        return await query(link, operation)
+
+    query = RcmLink.query
+    async with small_fleet("one") as (_, (one,)):
+        arc, _ = await held(one, "first")
+        monkeypatch.setattr(RcmLink, "query", counted)
+        monkeypatch.setattr(rcm_link, "absurd", lambda *_, **__: True)
+        one.internals.rcm._on_leader(Token("b", Role.RCM, "rcm", "forger"), alive=True)
+        await until(lambda: asked >= 3, within=2.5)
+        assert arc.open
 
 
 async def test_what_was_granted_again_unheard_is_given_back_by_who_had_its_time(

@@ -271,16 +271,18 @@ class RcmLink:
         # With `term`, an RCM that was replaced learns so; it would refuse a place of a later RCM as impossible.
         show_term = self._rcm_is_behind or arc._place is not None
         reply = await self.query(msgspec.structs.replace(ask, term=self.term) if show_term else ask)
-        # An answer of a replaced RCM doesn't count.
-        self._unanswered = reply is None or (reply.message is not None and reply.message.term < self.term)
         if reply is None:
+            self._unanswered = True
             return None
         if reply.message is not None:
             self._rcm_is_behind = reply.message.term < self.term
-        elif reply.problem is not None:
-            self._rcm_is_behind = reply.problem.code == "old_term"
-        if reply.message is not None and self.accept(reply.message.term):
-            self.store.take(arc, reply.message)
+            # Neither an answer of a replaced RCM counts, nor one in an absurd term.
+            self._unanswered = not self.accept(reply.message.term)
+            if not self._unanswered:
+                self.store.take(arc, reply.message)
+        else:
+            self._unanswered = False
+            self._rcm_is_behind = reply.problem is not None and reply.problem.code == "old_term"
         return reply.problem
 
     async def keep_asking(self) -> NoReturn:
