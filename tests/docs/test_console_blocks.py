@@ -100,10 +100,11 @@ BLOCKS: Final = [
 BEFORE: Final = {"docs/how-to/see-who-held-what.md": "docs/how-to/share-devices.md"}
 """Pages that show holds of another one."""
 VARIES: Final = re.compile(
-    r"\b(?:Mon|Tue|Wed|Thu|Fri|Sat|Sun)\b|-?\b(?:[0-9a-f]{8}|[0-9a-f]{12})\b|\([\w/]+/[\w/]+\)|[\d.,:-]*\d"
+    r"\b(?:Mon|Tue|Wed|Thu|Fri|Sat|Sun)\b|\b(?:Jan|Feb|Mar|Apr|May|Jun|Jul|Aug|Sep|Oct|Nov|Dec)\b"
+    r"|-?\b(?:[0-9a-f]{8}|[0-9a-f]{12})\b|\([\w/]+/[\w/]+\)|[\d.,:-]*\d"
     r"|\b(?:d|h|min|s|MiB|GiB)\b|\.\.\.|…|[,;:()]"
 )
-"""Days, ids, zones, numbers, units and punctuation."""
+"""Days, months, ids, zones, numbers, units and punctuation."""
 WAITS: Final = re.compile(r"^\S+ waits\b", re.MULTILINE)
 DEVICES: Final = (
     "robot/arm1",

@@ -14,6 +14,7 @@ from tests.cli.tools import end
 from tests.hang import HANG
 from tests.live.lab import Lab, LeaderWatch
 from tests.live.test_tokens import started
+from tests.mesh.kit import until
 from zscout.behaviors.client.bookings import BookingsClient
 from zscout.messages import RcmState
 
@@ -35,9 +36,13 @@ async def test_an_equal_waits_for_a_command_under_the_next_leader_too_and_a_high
         lab.node("b")
         await lab.candidates(client, "a", "b")
         watch = LeaderWatch(client)
-        running = started(lab, "request", "robot/*", "robot/*#2", "--name", "job", "--", "sleep", "3000")
+        begun = tmp_path / "begun"
+        script = f"touch {begun}; exec sleep 3000"
+        running = started(lab, "request", "robot/*", "robot/*#2", "--name", "job", "--", "sh", "-c", script)
         try:
             await lab.state(client, is_held_for_an_hour)
+            # A program that has not confirmed its grant yet waits again instead of ending.
+            await until(begun.exists, within=HANG)
             equal = await client.request("next", {"robot/*": {}}, min_runtime=60)
             lab.signal("a", signal.SIGKILL)
             await watch.lost("a")

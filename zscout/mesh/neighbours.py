@@ -141,10 +141,10 @@ def _shut(links: Collection[tuple[_Address, _Address]]) -> None:
             if not stat.S_ISSOCK(fd.stat().st_mode):
                 continue
             # A copy: the descriptor may be closed meanwhile, and its number be given to another file.
-            with socket.socket(fileno=os.dup(int(fd.name))) as one:
-                inet = one.family in (socket.AF_INET, socket.AF_INET6)
-                if inet and (_plain(one.getsockname()), _plain(one.getpeername())) in links:
-                    one.shutdown(socket.SHUT_RDWR)
+            with socket.socket(fileno=os.dup(int(fd.name))) as copy:
+                inet = copy.family in (socket.AF_INET, socket.AF_INET6)
+                if inet and (_plain(copy.getsockname()), _plain(copy.getpeername())) in links:
+                    copy.shutdown(socket.SHUT_RDWR)
 
 
 def _listening() -> set[int]:
