@@ -89,12 +89,13 @@ async def crowd(
     ]
 
 
-async def behave(client: Client, rng: random.Random, until: float) -> int:
-    """Run one behavior: request one to five RCs, give them back once granted, and repeat. Return the number of
-    grants."""
+async def behave(client: Client, rng: random.Random, until: float, which: str) -> int:
+    """Run one behavior: request one to five RCs (of the empty queryable always those of its answer), give them back
+    once granted, and repeat. Return the number of grants."""
     cycles = 0
     while time.monotonic() < until:
-        needs = {rc: {} for rc in rng.sample(EXCLUSIVE, rng.randint(1, MOST))}  # type: ignore[var-annotated]
+        rcs = GRANTED.rcs if which == "empty" else rng.sample(EXCLUSIVE, rng.randint(1, MOST))
+        needs = {rc: {} for rc in rcs}  # type: ignore[var-annotated]
         arc = await client.request("crowd", needs, min_runtime=HOLD)
         await running(client, arc)
         cycles += time.monotonic() < until
@@ -108,15 +109,16 @@ async def program(fleet_file: Path, empty_file: Path, number: int, behaviors: in
         for which, file in (("rcm", fleet_file), ("empty", empty_file))
     }
     rngs = [random.Random(SEED + number * behaviors + which) for which in range(behaviors)]  # noqa: S311
-    for client in clients.values():
+    for which, client in clients.items():
         # An answer shows that the client is linked.
-        await client.end(await client.request("hello", {EXCLUSIVE[number]: {}}, min_runtime=HOLD))
+        rcs = GRANTED.rcs if which == "empty" else EXCLUSIVE[number : number + 1]
+        await client.end(await client.request("hello", {rc: {} for rc in rcs}, min_runtime=HOLD))
     ready()
     while line := await asyncio.to_thread(sys.stdin.readline):
         order = json.loads(line)
         until = time.monotonic() + order["seconds"]
         client = clients[order["which"]]
-        cycles = await asyncio.gather(*(behave(client, rng, until) for rng in rngs))
+        cycles = await asyncio.gather(*(behave(client, rng, until, order["which"]) for rng in rngs))
         print(json.dumps(sum(cycles)), flush=True)
     for client in clients.values():
         await client.close()
