@@ -29,7 +29,7 @@ LISTEN_TIMEOUT_S: Final = 0.5
 RELINK_TIMEOUT_S: Final = 0.5
 POLL_S: Final = 0.005
 YOUNG: Final = 2 * SECOND
-"""A neighbour that was opened so long ago listens, or its process hangs."""
+"""Nanoseconds. A neighbour that was opened so long ago listens, or its process hangs."""
 _NAMES: Final = Path("/proc/net/unix")
 _LISTENERS: Final = Path("/proc/net/tcp")
 _LISTENS: Final = re.compile(r"^ *\d+: 0100007F:([0-9A-F]{4}) \S+ 0A ", re.MULTILINE)
@@ -77,7 +77,7 @@ class Meeting:
 
     def wait_for_others(self) -> None:
         """Wait until the neighbours listen that were opened at about the same time. Blocks LISTEN_TIMEOUT_S at most."""
-        tries = round(LISTEN_TIMEOUT_S / POLL_S)
+        tries = round(LISTEN_TIMEOUT_S / POLL_S) if self._young else 0
         while tries and not self._young <= _listening():
             tries -= 1
             time.sleep(POLL_S)
