@@ -166,14 +166,6 @@ class Fleet:
         await program.process.wait()
         await asyncio.to_thread(self.processes.kill, host)
 
-    async def works_on(self, host: str) -> list[dict[str, Any]]:
-        """Wait until the device of a program has obeyed once more. Return its trouble until then."""
-        program, until = self.programs[host], time.monotonic() + DOWN
-        while not (found := await program.trouble()) and not program.beats:
-            if time.monotonic() > until:
-                return [{"event": "another grant"}]
-        return [{"had": program.grant, **event} for event in found]
-
     async def whole(self, rcs: Collection[str], hosts: Sequence[str] = CANDIDATES, within: float = 30.0) -> str:
         """Wait until the programs of these hosts see the same leader with these devices. Return the leader's host."""
         async with asyncio.timeout(within):

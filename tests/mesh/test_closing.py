@@ -6,6 +6,7 @@ import asyncio
 import socket
 import threading
 import time
+from collections.abc import Iterator
 from types import SimpleNamespace
 from typing import Any
 
@@ -15,7 +16,8 @@ from msgspec.structs import replace
 
 from tests.hang import HANG
 from tests.mesh.both_meshes import ASK, LONG, NEWS, Ping, Pong, World, token
-from zscout.config.fleet import MeshConfig, default_fleet
+from tests.mesh.kit import until
+from zscout.config.fleet import Fleet, MeshConfig, default_fleet
 from zscout.keyexpr import Role, Sender
 from zscout.mesh import MeshError, ZenohMesh, zenoh_mesh
 
@@ -130,3 +132,44 @@ def test_a_port_in_use_is_named_without_the_places_in_zenohs_source() -> None:
     assert f"127.0.0.1:{port}: Address already in use" in words
     assert ".rs" not in words
     assert words.endswith("]; check listen and connect under [mesh]")
+
+
+@pytest.fixture
+def silent() -> Iterator[int]:
+    """The port of a process that is frozen: the kernel accepts connections for it, and nobody answers."""
+    with socket.socket() as frozen:
+        frozen.bind(("127.0.0.1", 0))
+        frozen.listen(64)
+        yield frozen.getsockname()[1]
+
+
+def connecting(fleet: Fleet, host: str, port: int) -> Fleet:
+    return replace(fleet, mesh=MeshConfig(multicast=False, connect=(f"tcp/{host}:{port}",)))
+
+
+@pytest.mark.real_time
+async def test_a_frozen_process_that_is_sought_holds_up_nobody_who_leaves(
+    silent: int, caplog: pytest.LogCaptureFixture
+) -> None:
+    fleet = connecting(default_fleet(), "127.0.0.1", silent)
+    async with await ZenohMesh.open(fleet, Sender("a", "stays")) as stays:
+        async with await ZenohMesh.open(fleet, Sender("a", "leaves")) as leaves:
+            await until(lambda: stays.links() == leaves.links() == 1)
+        assert "did not close" not in caplog.text
+
+
+@pytest.mark.real_time
+async def test_a_session_that_closes_slowly_is_left_at_once_by_its_peers(
+    silent: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(zenoh_mesh, "CLOSE_TIMEOUT", 1.0)
+    fleet = connecting(default_fleet(), "localhost", silent)  # a name, so its connections are unknown
+    async with await ZenohMesh.open(fleet, Sender("a", "stays")) as stays:
+        leaves = await ZenohMesh.open(fleet, Sender("a", "leaves"))
+        await until(lambda: stays.links() == leaves.links() == 1)
+        session = leaves._transport.current
+        leaving = asyncio.create_task(leaves.close())
+        await until(lambda: stays.links() == 0)
+        assert not leaving.done()
+        assert session.links() == 0
+        await leaving

@@ -2,25 +2,24 @@
 
 Each session listens on loopback, and publishes its port in the name of an abstract Linux socket. The kernel lists these
 names, removes them with their process, and keeps them apart for each network namespace, as it does loopback. A new
-session connects to the sessions that it finds. Where multicast was first, and linked the two by a network address, the
-new session ends that link: it would end with the address. Like an answer to multicast, a name grants no rights: it only
-gives an address."""
+session connects to the sessions that it finds. Where multicast or gossip was first, and linked the two by a network
+address, that link is shut down: it would end with the address. Like an answer to multicast, a name grants no rights:
+it only gives an address."""
 
 from __future__ import annotations
 
 import hashlib
 import ipaddress
-import os
 import re
 import socket
-import stat
 import time
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, Final, Protocol, TypeAlias
+from typing import Final
 
 from zscout.config.fleet import MeshConfig
+from zscout.mesh.links import Link, ends, is_local, shut
 from zscout.types import SECOND
 
 MAX_NEIGHBOURS: Final = 64
@@ -33,21 +32,8 @@ YOUNG: Final = 2 * SECOND
 _NAMES: Final = Path("/proc/net/unix")
 _LISTENERS: Final = Path("/proc/net/tcp")
 _LISTENS: Final = re.compile(r"^ *\d+: 0100007F:([0-9A-F]{4}) \S+ 0A ", re.MULTILINE)
-_LOCATOR: Final = re.compile(r"[a-z]+/\[?(?P<ip>[0-9a-f.:]+)\]?:(?P<port>[0-9]+)")
 _RETRY: Final = "#retry_period_init_ms=50;retry_period_max_ms=5000;retry_period_increase_factor=2"
 """Retry seldom: Zenoh tries to reach an ended neighbour as long as this session lives."""
-
-_Address: TypeAlias = tuple[str, int]
-
-
-class Link(Protocol):
-    """A link of a session, by the endpoints of both ends."""
-
-    @property
-    def src(self) -> object: ...
-
-    @property
-    def dst(self) -> object: ...
 
 
 class Meeting:
@@ -58,6 +44,7 @@ class Meeting:
 
     def __init__(self, fleet: str, mesh: MeshConfig, protocol: str) -> None:
         meeting = hashlib.sha256(" ".join([fleet, *mesh.known_by]).encode()).hexdigest()[:16]
+        self._name = f"zscout-mesh-{meeting}-{protocol}"
         self._reserved = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
         self._published = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
         try:
@@ -67,8 +54,8 @@ class Meeting:
             port, self.at = self._reserved.getsockname()[1], time.time_ns()
             self.endpoint = f"{protocol}/127.0.0.1:{port}"
             # Publish before listing: of two sessions that start together at least one finds the other.
-            self._published.bind(f"\0zscout-mesh-{meeting}-{protocol}-{port}-{self.at}")
-            older = _older(meeting, protocol, self.at)
+            self._published.bind(f"\0{self._name}-{port}-{self.at}")
+            older = [(at, port) for at, port in _published(self._name) if at < self.at][:MAX_NEIGHBOURS]
             self.others = [f"{protocol}/127.0.0.1:{port}{_RETRY}" for _, port in older]
             self._young = {port for at, port in older if self.at - at < YOUNG}
         except OSError:
@@ -89,14 +76,23 @@ class Meeting:
         # Those of the same moment may not be linked yet.
         wanted = len(others) if self._young else 0
         for _ in range(round(RELINK_TIMEOUT_S / POLL_S)):
-            found = [link for link in links() if _is_local(link)]
-            outside = [ends for ends in map(_ends, found) if not ipaddress.ip_address(ends[0][0]).is_loopback]
+            found = [link for link in links() if is_local(link)]
+            outside = {both for both in map(ends, found) if not ipaddress.ip_address(both[0][0]).is_loopback}
             if outside and not others <= {str(link.dst) for link in found}:
                 wanted = max(wanted, len(found))
-                _shut(outside)
+                shut(lambda here, there, outside=outside: (here, there) in outside)  # type: ignore[misc]
             elif len(found) >= wanted:
                 return
             time.sleep(POLL_S)
+
+    def is_detour(self, peer: str, link: Link) -> bool:
+        """Return True for a link to the session `peer` of a neighbour by a network address of this host."""
+        if not is_local(link) or ipaddress.ip_address(ends(link)[0][0]).is_loopback:
+            return False
+        known = [at for at, _ in _published(self._name)]
+        # The newer of both makes the link by loopback, if the older is among those to which it connects.
+        there = [at for at in known if peer.endswith(time_in_id(at))]
+        return any(min(at, self.at) in known[:MAX_NEIGHBOURS] for at in there)
 
     def release_port(self) -> None:
         """Close the reserving socket: Zenoh listens on the port now."""
@@ -107,44 +103,18 @@ class Meeting:
         self._published.close()
 
 
-def _older(meeting: str, protocol: str, before: int) -> list[tuple[int, int]]:
-    """Times and ports of older neighbours, the oldest first: of two sessions the newer one makes the link."""
-    name = re.compile(rf"@zscout-mesh-{meeting}-{protocol}-(\d{{1,5}})-(\d{{1,20}})$", re.ASCII | re.MULTILINE)
+def time_in_id(at: int) -> str:
+    """The last digits of the id of a session that was published at `at`, in ns since 1970."""
+    return at.to_bytes(8, "little").hex()[4:]
+
+
+def _published(name: str) -> list[tuple[int, int]]:
+    """Times and ports of all sessions that are published under a name, the oldest first."""
+    pattern = re.compile(rf"@{name}-(\d{{1,5}})-(\d{{1,19}})$", re.ASCII | re.MULTILINE)
     found = list[tuple[int, int]]()
     with suppress(OSError):
-        found = [(int(at), int(port)) for port, at in name.findall(_NAMES.read_text(errors="replace"))]
-    return sorted((at, port) for at, port in found if at < before and 0 < port < 65_536)[:MAX_NEIGHBOURS]
-
-
-def _ends(link: Link) -> tuple[_Address, _Address]:
-    """Addresses and ports of both ends; empty for links other than TCP and TLS."""
-    found = [_LOCATOR.fullmatch(str(end)) for end in (link.src, link.dst)]
-    here, there = [_plain((end["ip"], int(end["port"]))) if end is not None else ("", 0) for end in found]
-    return here, there
-
-
-def _plain(address: Sequence[Any]) -> _Address:
-    """An address of `socket` without scope, and without the form of IPv4 addresses that IPv6 sockets have."""
-    return str(address[0]).removeprefix("::ffff:"), int(address[1])
-
-
-def _is_local(link: Link) -> bool:
-    """Return True for a link within this host."""
-    (here, _), (there, _) = _ends(link)
-    return here == there != ""
-
-
-def _shut(links: Collection[tuple[_Address, _Address]]) -> None:
-    """Shut down the sockets of this process with these ends: Zenoh can't end a single link."""
-    for fd in Path("/proc/self/fd").iterdir():
-        with suppress(OSError):
-            if not stat.S_ISSOCK(fd.stat().st_mode):
-                continue
-            # A copy: the descriptor may be closed meanwhile, and its number be given to another file.
-            with socket.socket(fileno=os.dup(int(fd.name))) as copy:
-                inet = copy.family in (socket.AF_INET, socket.AF_INET6)
-                if inet and (_plain(copy.getsockname()), _plain(copy.getpeername())) in links:
-                    copy.shutdown(socket.SHUT_RDWR)
+        found = [(int(at), int(port)) for port, at in pattern.findall(_NAMES.read_text(errors="replace"))]
+    return sorted((at, port) for at, port in found if 0 < port < 65_536)
 
 
 def _listening() -> set[int]:

@@ -22,6 +22,8 @@ from typing import Any, Final
 import zenoh
 from zenoh.handlers import Callback
 
+from zscout.mesh.links import SESSIONS
+
 log = logging.getLogger(__name__)
 
 ATTEMPT_PAUSES: Final = (0.02, 0.1, 0.1, 0.2, 0.2, 0.5, *(1.0,) * 30)
@@ -192,12 +194,15 @@ class Relinking:
         addresses = [address for known in there.values() for address in known]
         peers, settings = there.keys() - {self._own}, self._meeting(addresses)
         settings.insert_json5("id", f'"{TEMPORARY_ID}{secrets.token_hex(10)}"')
-        with zenoh.open(settings):
+        temporary = SESSIONS.open(settings)
+        try:
             until = time.monotonic() + MEET_TIMEOUT
             while time.monotonic() < until and not self._closed.wait(POLL):
                 if peers <= self._linked():
                     log.info("linked again: %s", ", ".join(sorted(peers)))
                     return
+        finally:
+            SESSIONS.close(temporary, addresses)
 
 
 def _listens(addresses: Sequence[str]) -> bool | None:

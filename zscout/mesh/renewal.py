@@ -25,6 +25,7 @@ FORGET_AFTER: Final = 60.0  # seconds after which a contradiction is forgotten u
 OVERLAP: Final = 0.5  # seconds with both sessions open, for others to learn the declarations of the new one
 MAX_OVERLAPS: Final = 3  # overlaps to wait for each peer of the old session to have a link to the new one
 LINK_TIMEOUT: Final = 2.0  # seconds for the new session to link to the peers of the old one
+LEAVE_TIMEOUT: Final = 0.5  # seconds to wait for the old session to close; its links end sooner
 LOOK_EVERY: Final = 0.02
 MIN_PAUSE, MAX_PAUSE = 10.0, 320.0  # seconds between renewals, doubled while a contradiction outlives them
 
@@ -87,6 +88,7 @@ class RenewableTransport(Transport):
         self._tokens: WeakValueDictionary[int, _Token] = WeakValueDictionary()  # die with their undeclare function
         self._numbers = itertools.count()
         self._renewing: asyncio.Task[None] | None = None
+        self._leaving: set[asyncio.Task[None]] = set()
         self._closed = False
         self.behind = False
         """True if the present session lacks the latest settings: a renewal began before they changed, or failed."""
@@ -124,7 +126,7 @@ class RenewableTransport(Transport):
                         if set(old.peers()) <= known:
                             break
                 finally:
-                    await old.close()
+                    await self._leave(old)
                     for declared in self._all():
                         declared.forget_old()
             failed = False
@@ -138,6 +140,13 @@ class RenewableTransport(Transport):
             self.behind |= wanted
         elif self.behind:
             self.renew()
+
+    async def _leave(self, old: Transport) -> None:
+        """Close `old`, without waiting for the end of an attempt to connect: new settings may be due."""
+        leaving = asyncio.create_task(old.close())
+        self._leaving.add(leaving)
+        leaving.add_done_callback(self._leaving.discard)
+        await asyncio.wait({leaving}, timeout=LEAVE_TIMEOUT)
 
     async def _linked(self, old: Transport, fresh: Transport) -> None:
         """Wait until `fresh` has links to all peers of `old`, at most LINK_TIMEOUT seconds."""
@@ -186,7 +195,7 @@ class RenewableTransport(Transport):
         if self._renewing is not None:
             self._renewing.cancel()
             await asyncio.wait({self._renewing})
-        await self.current.close()
+        await asyncio.gather(self.current.close(), *self._leaving)
 
     def get(self, key: str, payload: bytes | None, kind: type | None, timeout: float, to: Collector) -> None:
         self.current.get(key, payload, kind, timeout, to)

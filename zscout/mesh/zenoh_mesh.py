@@ -33,7 +33,8 @@ from zscout.keyexpr import FleetMember, Keys, Sender, access_control
 from zscout.logs import shortage
 from zscout.mesh import interfaces
 from zscout.mesh.exchange import SPAWN, MeshError
-from zscout.mesh.neighbours import Meeting
+from zscout.mesh.links import SESSIONS, ends, shut
+from zscout.mesh.neighbours import Meeting, time_in_id
 from zscout.mesh.relinking import TEMPORARY_ID, Relinking
 from zscout.mesh.renewal import RenewableTransport
 from zscout.mesh.session import Mesh
@@ -280,8 +281,7 @@ def _security(fleet: Fleet, keys: Keys, me: Sender) -> Security:
 def increasing_id(at: int | None = None) -> str:
     """A session id greater than all earlier ones, so that the newer session makes the links. `at`: its time, in ns
     since 1970; None: now. Zenoh compares ids from the last byte on, and prints them as a number."""
-    time_ns = time.time_ns() if at is None else at
-    return f"1{secrets.token_hex(9)}0{time_ns.to_bytes(8, 'little').hex()[4:]}"
+    return f"1{secrets.token_hex(9)}0{time_in_id(time.time_ns() if at is None else at)}"
 
 
 def check_room(files: int = SESSION_FILES, threads: int = SESSION_THREADS) -> None:
@@ -316,7 +316,7 @@ def open_session(settings: Callable[[], zenoh.Config]) -> zenoh.Session:
     if THREADS not in os.environ:
         os.putenv(THREADS, MANY_THREADS)
     try:
-        return zenoh.open(settings())
+        return SESSIONS.open(settings())
     except zenoh.ZError as error:
         # Without positions in Zenoh's source.
         why = re.sub(r" at \S+\.rs:[0-9]+\.?", "", str(error))
@@ -340,7 +340,7 @@ async def _open(fleet: str, config: MeshConfig, security: Security | None) -> Tr
             try:
                 met.relink(opened.info.links)
             except BaseException:
-                opened.close()  # type: ignore[no-untyped-call]
+                SESSIONS.close(opened, met.others)
                 raise
         return opened
 
@@ -352,7 +352,7 @@ async def _open(fleet: str, config: MeshConfig, security: Security | None) -> Tr
             met.close()
         # Close in a thread: this callback may run on the event loop's.
         opening.add_done_callback(
-            lambda opened: opened.exception() or in_thread("closes the mesh", opened.result().close)
+            lambda opened: opened.exception() or in_thread("closes the mesh", lambda: SESSIONS.close(opened.result()))
         )
         raise
     if met is not None:
@@ -360,9 +360,10 @@ async def _open(fleet: str, config: MeshConfig, security: Security | None) -> Tr
     try:
         # A relay leaves relinking to its sites, which have its address.
         relinks = config.multicast and not config.relay
-        return ZenohTransport(session, _relinking(session, config, security) if relinks else None, met)
+        relinking = _relinking(session, config, security) if relinks else None
+        return ZenohTransport(session, relinking, met, config.connect)
     except BaseException:
-        in_thread("closes the mesh", session.close)
+        in_thread("closes the mesh", functools.partial(SESSIONS.close, session))
         raise
 
 
@@ -400,11 +401,25 @@ class ZenohTransport(Transport):
     # Callbacks run directly on Zenoh's threads: a plain function would get a thread per declaration and query.
 
     def __init__(
-        self, session: zenoh.Session, relinking: Relinking | None = None, meeting: Meeting | None = None
+        self,
+        session: zenoh.Session,
+        relinking: Relinking | None = None,
+        meeting: Meeting | None = None,
+        connect: Sequence[str] = (),
     ) -> None:
         self._session, self._relinking, self._meeting = session, relinking, meeting
+        self._sought = [*connect, *(() if meeting is None else meeting.others)]
+        if meeting is not None:
+            self._listener = session.info.declare_link_events_listener(_direct(self._on_link), history=True)
         self._queriers: dict[tuple[str, float], zenoh.Querier] = {}  # by key and timeout
         self._asked_once: dict[tuple[str, float], None] = {}
+
+    def _on_link(self, event: zenoh.LinkEvent) -> None:
+        """Shut down a link to a neighbour by a network address: by loopback it outlasts the address."""
+        made = event.kind == zenoh.SampleKind.PUT
+        if made and self._meeting is not None and self._meeting.is_detour(str(event.link.zid), event.link):
+            detour = ends(event.link)
+            shut(lambda here, there: (here, there) == detour)
 
     def id(self) -> str:
         return str(self._session.info.zid())
@@ -426,7 +441,7 @@ class ZenohTransport(Transport):
         def close() -> None:
             if self._relinking is not None:
                 self._relinking.close()
-            self._session.close()  # type: ignore[no-untyped-call]
+            SESSIONS.close(self._session, self._sought)
 
         closing = in_thread("closes the mesh", close)
         try:

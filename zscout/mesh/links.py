@@ -1,0 +1,124 @@
+"""The sockets of a Zenoh session: how it closes at once, and loses single links.
+
+Zenoh closes a session only after each of its attempts to connect has ended. A process that is frozen, or cut off in the
+middle, lets an attempt last 10 s, in which all links of the session stand, and peers take it for alive
+(docs/zenoh.md)."""
+
+from __future__ import annotations
+
+import os
+import re
+import socket
+import stat
+import threading
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, Final, Protocol, TypeAlias
+
+import zenoh
+
+CLOSE_SOON_S: Final = 0.25
+"""Seconds after which a session that is being closed loses its sockets."""
+_LOCATOR: Final = re.compile(r"[a-z]+/\[?(?P<ip>[0-9a-f.:]+)\]?:(?P<port>[0-9]+)(?:[?#].*)?")
+
+Address: TypeAlias = tuple[str, int]
+Ends: TypeAlias = tuple[Address, Address]
+"""The address and port of this end, and of the other end."""
+NOWHERE: Final[Address] = ("", 0)
+
+
+class Link(Protocol):
+    """A link of a session, by the endpoints of both ends."""
+
+    @property
+    def src(self) -> object: ...
+
+    @property
+    def dst(self) -> object: ...
+
+
+class Sessions:
+    """The open sessions of this process."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._open: list[zenoh.Session] = []
+
+    def open(self, settings: zenoh.Config) -> zenoh.Session:
+        """Raises ZError."""
+        session = zenoh.open(settings)
+        with self._lock:
+            self._open.append(session)
+        return session
+
+    def close(self, session: zenoh.Session, sought: Iterable[str] = ()) -> None:
+        """Close a session, which may be trying to connect to the endpoints `sought`. Blocks, for up to 10 s if it tries
+        to connect to others; its links end after CLOSE_SOON_S. Raises ZError."""
+        own, errors = _links(session), list[zenoh.ZError]()
+
+        def close() -> None:
+            try:
+                session.close()  # type: ignore[no-untyped-call]
+            except zenoh.ZError as error:
+                errors.append(error)
+
+        with self._lock:
+            self._open = [other for other in self._open if other is not session]
+            others = list(self._open)
+        closing = threading.Thread(target=close, name="closes a session", daemon=True)
+        closing.start()
+        closing.join(CLOSE_SOON_S)
+        if closing.is_alive():
+            kept = {link for other in others for link in _links(other)}
+            attempts = {address(endpoint) for endpoint in sought} - {NOWHERE}
+            shut(lambda here, there: (here, there) in own or (there in attempts and (here, there) not in kept))
+            closing.join()
+        if errors:
+            raise errors[0]
+
+
+SESSIONS: Final = Sessions()
+
+
+def _links(session: zenoh.Session) -> set[Ends]:
+    with suppress(zenoh.ZError):  # it is being closed
+        return {ends(link) for link in session.info.links()}
+    return set()
+
+
+def address(endpoint: object) -> Address:
+    """The address and port of an endpoint of TCP or TLS; NOWHERE for names, and for other endpoints."""
+    found = _LOCATOR.fullmatch(str(endpoint))
+    return NOWHERE if found is None else _plain((found["ip"], int(found["port"])))
+
+
+def ends(link: Link) -> Ends:
+    return address(link.src), address(link.dst)
+
+
+def is_local(link: Link) -> bool:
+    """Return True for a link within this host."""
+    (here, _), (there, _) = ends(link)
+    return here == there != ""
+
+
+def shut(chosen: Callable[[Address, Address], bool]) -> None:
+    """Shut down the connections of this process with chosen ends: Zenoh can't end a single link."""
+    files = list[Path]()
+    with suppress(OSError):  # not on Linux
+        files = list(Path("/proc/self/fd").iterdir())
+    for fd in files:
+        with suppress(OSError):
+            if not stat.S_ISSOCK(fd.stat().st_mode):
+                continue
+            # A copy: the descriptor may be closed meanwhile, and its number be given to another file.
+            with socket.socket(fileno=os.dup(int(fd.name))) as copy:
+                inet = copy.family in (socket.AF_INET, socket.AF_INET6) and copy.type == socket.SOCK_STREAM
+                if inet and chosen(_plain(copy.getsockname()), _plain(copy.getpeername())):
+                    copy.shutdown(socket.SHUT_RDWR)
+
+
+def _plain(name: Sequence[Any]) -> Address:
+    """An address of `socket` without scope, and without the form of IPv4 addresses that IPv6 sockets have."""
+    return str(name[0]).removeprefix("::ffff:"), int(name[1])
