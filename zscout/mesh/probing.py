@@ -29,6 +29,7 @@ from zscout.config.fleet import MeshConfig, ip_of
 from zscout.config.strict import BadInput, Where
 from zscout.keyexpr import NAME, ROOT, Role
 from zscout.mesh.exchange import MeshError
+from zscout.mesh.links import SESSIONS
 from zscout.mesh.relinking import TEMPORARY_ID
 from zscout.mesh.zenoh_mesh import check_room, in_thread, open_session, zenoh_config
 from zscout.types import clean
@@ -267,14 +268,18 @@ def plain_fleets(addresses: Sequence[str]) -> dict[str, set[str]]:
     for key, value in settings.items():
         config.insert_json5(key, json.dumps(value))
     found: dict[str, set[str]] = {}
-    with suppress(zenoh.ZError, MeshError), open_session(lambda: config) as session:
-        until = time.monotonic() + LINK
-        while len(list(session.info.peers_zid())) < len(addresses) and time.monotonic() < until:
-            time.sleep(POLL)
-        for number, reply in enumerate(session.liveliness().get(f"{ROOT}/*/alive/*/{Role.NODE}/**", timeout=LIST)):
-            if reply.ok is None or number > MAX_TOKENS:
-                continue
-            _, fleet, _, host, *_ = str(reply.ok.key_expr).split("/")
-            if NAME.fullmatch(fleet) and NAME.fullmatch(host):
-                found.setdefault(fleet, set()).add(host)
+    with suppress(zenoh.ZError, MeshError):
+        session = open_session(lambda: config)
+        try:
+            until = time.monotonic() + LINK
+            while len(list(session.info.peers_zid())) < len(addresses) and time.monotonic() < until:
+                time.sleep(POLL)
+            for number, reply in enumerate(session.liveliness().get(f"{ROOT}/*/alive/*/{Role.NODE}/**", timeout=LIST)):
+                if reply.ok is None or number > MAX_TOKENS:
+                    continue
+                _, fleet, _, host, *_ = str(reply.ok.key_expr).split("/")
+                if NAME.fullmatch(fleet) and NAME.fullmatch(host):
+                    found.setdefault(fleet, set()).add(host)
+        finally:
+            SESSIONS.close(session, addresses)
     return found
