@@ -5,9 +5,9 @@
 Orders come as JSON lines on stdin, what happens goes out as JSON lines on stdout, with `at` in ns of this host's clock.
 Orders: {"order": "ask", "arc", "needs", "priority", "min_runtime", "keep"}, {"order": "command", "rc", "do", "ttl"}
 under the last grant of this process, with "anew" one without an id, {"order": "work", "rcs"}: commands these RCs all
-the time, until one refuses it or the hold is lost ("disturbed"); {"order": "beats"}: how often they have obeyed since it was asked last;
-{"order": "state"}: the RCM's; {"order": "time", "rc"}: how long it takes from a request to the confirmed grant;
-{"order": "end"}. It ends when its stdin does.
+the time, until one refuses it or the hold is lost ("disturbed"); {"order": "beats"}: how often they have obeyed since
+it was asked last; {"order": "state"}: the RCM's; {"order": "time", "rc"}: how long it takes from a request to the
+confirmed grant; {"order": "end"}. It ends when its stdin does.
 """
 
 from __future__ import annotations
