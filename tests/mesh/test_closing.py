@@ -7,6 +7,7 @@ import socket
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import ExitStack
 from types import SimpleNamespace
 from typing import Any
 
@@ -20,6 +21,7 @@ from tests.mesh.kit import until
 from zscout.config.fleet import Fleet, MeshConfig, default_fleet
 from zscout.keyexpr import Role, Sender
 from zscout.mesh import MeshError, ZenohMesh, zenoh_mesh
+from zscout.ports import free_port
 
 
 class StuckSession:
@@ -134,12 +136,19 @@ def test_a_port_in_use_is_named_without_the_places_in_zenohs_source() -> None:
     assert words.endswith("]; check listen and connect under [mesh]")
 
 
-@pytest.fixture
-def silent() -> Iterator[int]:
-    """The port of a process that is frozen: the kernel accepts connections for it, and nobody answers."""
-    with socket.socket() as frozen:
+@pytest.fixture(params=["accepts", "drops"])
+def silent(request: pytest.FixtureRequest) -> Iterator[int]:
+    """The port of a process that is frozen: the kernel accepts connections for it, and nobody answers; or it has no
+    room for more, and drops them, as those to a host that is off."""
+    with ExitStack() as stack:
+        frozen = stack.enter_context(socket.socket())
         frozen.bind(("127.0.0.1", 0))
-        frozen.listen(64)
+        frozen.listen(64 if request.param == "accepts" else 0)
+        if request.param == "drops":
+            for _ in range(4):
+                waiting = stack.enter_context(socket.socket())
+                waiting.setblocking(False)
+                waiting.connect_ex(frozen.getsockname())
         yield frozen.getsockname()[1]
 
 
@@ -173,3 +182,21 @@ async def test_a_session_that_closes_slowly_is_left_at_once_by_its_peers(
         assert not leaving.done()
         assert session.links() == 0
         await leaving
+
+
+@pytest.mark.real_time
+async def test_a_session_that_closes_slowly_frees_its_port_for_the_next(
+    silent: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(zenoh_mesh, "CLOSE_TIMEOUT", 1.5)
+    fleet = connecting(default_fleet(), "localhost", silent)  # a name, so its connections are unknown
+    port = free_port("127.0.0.1", 0)
+    fleet = replace(fleet, mesh=replace(fleet.mesh, listen=(f"tcp/127.0.0.1:{port}",)))
+    async with await ZenohMesh.open(fleet, Sender("a", "node")) as mesh:
+        before = mesh._transport.id()
+        mesh._transport.renew()
+        await until(lambda: mesh._transport._renewing is None)
+        assert mesh._transport.id() != before
+        assert not mesh._transport.behind
+        transport = mesh._transport.current
+        assert fleet.mesh.listen[0] in transport._listening  # type: ignore[attr-defined]

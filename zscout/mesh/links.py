@@ -9,13 +9,12 @@ from __future__ import annotations
 import os
 import re
 import socket
-import stat
 import threading
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
-from pathlib import Path
 from typing import Any, Final, Protocol, TypeAlias
 
+import psutil
 import zenoh
 
 CLOSE_SOON_S: Final = 0.25
@@ -52,9 +51,9 @@ class Sessions:
             self._open.append(session)
         return session
 
-    def close(self, session: zenoh.Session, sought: Iterable[str] = ()) -> None:
-        """Close a session, which may be trying to connect to the endpoints `sought`. Blocks, for up to 10 s if it tries
-        to connect to others; its links end after CLOSE_SOON_S. Raises ZError."""
+    def close(self, session: zenoh.Session, sought: Iterable[str] = (), listening: Iterable[str] = ()) -> None:
+        """Close a session. It may be trying to connect to the endpoints `sought`; at `listening` only it may listen.
+        Blocks, for up to 10 s if it tries to connect elsewhere; its links end after CLOSE_SOON_S. Raises ZError."""
         own, errors = _links(session), list[zenoh.ZError]()
 
         def close() -> None:
@@ -72,7 +71,14 @@ class Sessions:
         if closing.is_alive():
             kept = {link for other in others for link in _links(other)}
             attempts = {address(endpoint) for endpoint in sought} - {NOWHERE}
-            shut(lambda here, there: (here, there) in own or (there in attempts and (here, there) not in kept))
+            ports = {address(endpoint)[1] for endpoint in listening} - {0}
+
+            def stays(here: Address, there: Address) -> bool:
+                if there == NOWHERE:
+                    return here[1] not in ports
+                return (here, there) not in own and (there not in attempts or (here, there) in kept)
+
+            shut(lambda here, there: not stays(here, there))
             closing.join()
         if errors:
             raise errors[0]
@@ -104,19 +110,15 @@ def is_local(link: Link) -> bool:
 
 
 def shut(chosen: Callable[[Address, Address], bool]) -> None:
-    """Shut down the connections of this process with chosen ends: Zenoh can't end a single link."""
-    files = list[Path]()
-    with suppress(OSError):  # not on Linux
-        files = list(Path("/proc/self/fd").iterdir())
-    for fd in files:
-        with suppress(OSError):
-            if not stat.S_ISSOCK(fd.stat().st_mode):
-                continue
-            # A copy: the descriptor may be closed meanwhile, and its number be given to another file.
-            with socket.socket(fileno=os.dup(int(fd.name))) as copy:
-                inet = copy.family in (socket.AF_INET, socket.AF_INET6) and copy.type == socket.SOCK_STREAM
-                if inet and chosen(_plain(copy.getsockname()), _plain(copy.getpeername())):
-                    copy.shutdown(socket.SHUT_RDWR)
+    """Shut down the sockets of this process with chosen ends: Zenoh can't end a single link. A listener has no other
+    end, NOWHERE."""
+    with suppress(psutil.Error, OSError):  # sockets can't be listed here
+        for found in psutil.Process().net_connections("tcp"):
+            if chosen(_plain(found.laddr), _plain(found.raddr) if len(found.raddr) else NOWHERE):
+                # A copy: the descriptor may be closed meanwhile, and its number be given to another socket.
+                with suppress(OSError), socket.socket(fileno=os.dup(found.fd)) as copy:
+                    if _plain(copy.getsockname()) == _plain(found.laddr):
+                        copy.shutdown(socket.SHUT_RDWR)
 
 
 def _plain(name: Sequence[Any]) -> Address:

@@ -25,7 +25,7 @@ FORGET_AFTER: Final = 60.0  # seconds after which a contradiction is forgotten u
 OVERLAP: Final = 0.5  # seconds with both sessions open, for others to learn the declarations of the new one
 MAX_OVERLAPS: Final = 3  # overlaps to wait for each peer of the old session to have a link to the new one
 LINK_TIMEOUT: Final = 2.0  # seconds for the new session to link to the peers of the old one
-LEAVE_TIMEOUT: Final = 0.5  # seconds to wait for the old session to close; its links end sooner
+LEAVE_TIMEOUT: Final = 1.0  # seconds to wait for the old session to close; its links end sooner
 LOOK_EVERY: Final = 0.02
 MIN_PAUSE, MAX_PAUSE = 10.0, 320.0  # seconds between renewals, doubled while a contradiction outlives them
 

@@ -361,7 +361,7 @@ async def _open(fleet: str, config: MeshConfig, security: Security | None) -> Tr
         # A relay leaves relinking to its sites, which have its address.
         relinks = config.multicast and not config.relay
         relinking = _relinking(session, config, security) if relinks else None
-        return ZenohTransport(session, relinking, met, config.connect)
+        return ZenohTransport(session, relinking, met, config)
     except BaseException:
         in_thread("closes the mesh", functools.partial(SESSIONS.close, session))
         raise
@@ -405,11 +405,13 @@ class ZenohTransport(Transport):
         session: zenoh.Session,
         relinking: Relinking | None = None,
         meeting: Meeting | None = None,
-        connect: Sequence[str] = (),
+        config: MeshConfig | None = None,
     ) -> None:
         self._session, self._relinking, self._meeting = session, relinking, meeting
-        self._sought = [*connect, *(() if meeting is None else meeting.others)]
+        self._sought, self._listening = ([], []) if config is None else ([*config.connect], [*config.listen])
         if meeting is not None:
+            self._sought += meeting.others
+            self._listening.append(meeting.endpoint)
             self._listener = session.info.declare_link_events_listener(_direct(self._on_link), history=True)
         self._queriers: dict[tuple[str, float], zenoh.Querier] = {}  # by key and timeout
         self._asked_once: dict[tuple[str, float], None] = {}
@@ -441,7 +443,7 @@ class ZenohTransport(Transport):
         def close() -> None:
             if self._relinking is not None:
                 self._relinking.close()
-            SESSIONS.close(self._session, self._sought)
+            SESSIONS.close(self._session, self._sought, self._listening)
 
         closing = in_thread("closes the mesh", close)
         try:
