@@ -83,6 +83,7 @@ PLAIN_ONLY: Final[dict[str, str]] = {
     "live/robots/test_warming_up.py": _RIGHTLESS,
     "live/test_blocking.py": _RIGHTLESS,
     "services/node/test_tree_load.py": _RIGHTLESS,
+    "live/test_crowd.py": "the benchmark's empty queryable is on a plain session",
     "live/test_moving.py": "kills processes around a move for two minutes; test_component_moves has moves with rights",
     "fuzz/test_live.py": _FORGES,
     "services/recorder/test_robots_heard.py": _FORGES,

@@ -12,7 +12,6 @@ from benchmarks.crowd import crowd
 pytestmark = [pytest.mark.live, pytest.mark.slow]
 
 
-@pytest.mark.plain_only("the empty queryable is a plain session")
 async def test_the_crowd_counts_grants_and_the_answers_of_the_empty_queryable(tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
     async with latency.fleet_of(tmp_path) as lab:
