@@ -817,6 +817,7 @@ def main() -> None:
         "scouting/gossip/autoconnect_strategy": GREATER_CONNECTS,
         "transport/link/tx/lease": LEASE_MS,
         block: LEASE_MS * 1000,
+        "transport/unicast/open_timeout": 2 * LEASE_MS,
         "transport/link/tx/queue/size/interactive_high": 8,
         "transport/shared_memory/enabled": False,
         "connect/retry": {"period_init_ms": 50, "period_max_ms": 500, "period_increase_factor": 1.5},

@@ -54,7 +54,7 @@ class Sessions:
     def close(self, session: zenoh.Session, sought: Iterable[str] = (), listening: Iterable[str] = ()) -> None:
         """Close a session. It may be trying to connect to the endpoints `sought`; at `listening` only it may listen.
         Blocks, for up to 10 s if it tries to connect elsewhere; its links end after CLOSE_SOON_S. Raises ZError."""
-        own, errors = _links(session), list[zenoh.ZError]()
+        errors = list[zenoh.ZError]()
 
         def close() -> None:
             try:
@@ -64,22 +64,23 @@ class Sessions:
 
         with self._lock:
             self._open = [other for other in self._open if other is not session]
-            others = list(self._open)
+        attempts = {address(endpoint) for endpoint in sought} - {NOWHERE}
+        ports = {address(endpoint)[1] for endpoint in listening} - {0}
         closing = threading.Thread(target=close, name="closes a session", daemon=True)
         closing.start()
         closing.join(CLOSE_SOON_S)
-        if closing.is_alive():
-            kept = {link for other in others for link in _links(other)}
-            attempts = {address(endpoint) for endpoint in sought} - {NOWHERE}
-            ports = {address(endpoint)[1] for endpoint in listening} - {0}
+        while closing.is_alive():  # others may link to it as long as it listens
+            own = _links(session)
+            with self._lock:
+                kept = {link for other in self._open for link in _links(other)}
 
-            def stays(here: Address, there: Address) -> bool:
+            def goes(here: Address, there: Address, own: set[Ends] = own, kept: set[Ends] = kept) -> bool:
                 if there == NOWHERE:
-                    return here[1] not in ports
-                return (here, there) not in own and (there not in attempts or (here, there) in kept)
+                    return here[1] in ports
+                return (here, there) in own or (there in attempts and (here, there) not in kept)
 
-            shut(lambda here, there: not stays(here, there))
-            closing.join()
+            shut(goes)
+            closing.join(CLOSE_SOON_S)
         if errors:
             raise errors[0]
 

@@ -54,6 +54,7 @@ MANY_THREADS = (
 )
 GREATER_CONNECTS = {"peer": {"to_router": "always", "to_peer": "greater-zid"}}
 CLOSE_TIMEOUT = 3.0  # seconds that closing a session may take
+OPEN_TIMEOUT, OPEN_TIMEOUT_DEFAULT = 2.0, 10.0  # seconds for an attempt to connect, unless two leases; Zenoh's default
 BLOCK, DROP = zenoh.CongestionControl.BLOCK, zenoh.CongestionControl.DROP
 CONTROL: Any = {"congestion_control": BLOCK, "priority": zenoh.Priority.INTERACTIVE_HIGH, "express": True}
 QUALITIES: dict[Quality, dict[str, Any]] = {
@@ -94,6 +95,8 @@ def zenoh_config(config: MeshConfig, security: Security | None = None, meeting: 
         # The same as the lease: on a busy host Zenoh's sending threads stall too, and a burst must not close a good
         # link.
         "transport/link/tx/queue/congestion_control/block/wait_before_close": round(config.lease * 1_000_000),
+        # An attempt that gets no answer delays attempts at other addresses of its peer, and the close (links.py).
+        "transport/unicast/open_timeout": round(1000 * min(OPEN_TIMEOUT_DEFAULT, max(OPEN_TIMEOUT, 2 * config.lease))),
         "transport/link/tx/queue/size": {"interactive_high": CONTROL_BATCHES},
         # Otherwise a sender could fill this process's memory.
         "transport/link/rx/max_message_size": MAX_MESSAGE,
