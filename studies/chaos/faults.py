@@ -122,7 +122,7 @@ KINDS: Final[dict[str, tuple[int, Callable[[random.Random, str], Fault]]]] = {
     "two frozen": (2, _two_frozen),
     "cut": (4, _any("cut", *HOSTS)),
     "unplugged": (2, _any("cable", *HOSTS)),
-    "readdressed": (0, _any("address", *NODES, *OWN_CLIENTS)),
+    "readdressed": (2, _any("address", *NODES, *OWN_CLIENTS)),
     "partition": (4, _ways(groups)),
     "pair": (5, _ways(_pair)),
     "one way": (3, _ways(_one_way)),
@@ -130,8 +130,7 @@ KINDS: Final[dict[str, tuple[int, Callable[[random.Random, str], Fault]]]] = {
     "client killed": (1, _any("kill", *CLIENTS)),
 }
 """The share of each kind, and its function, which draws a fault from a random source and the leader's host.
-`readdressed` comes only with `--only`: the protocol does not require programs to follow their host to another address,
-so the foreign programs lose links for long after it (docs/roadmap.md)."""
+`readdressed` takes addresses of hosts with programs of zscout only: the protocol does not require others to follow."""
 
 
 def draw(rng: random.Random, kinds: list[str], leader: str) -> Fault:
