@@ -188,7 +188,7 @@ async def test_a_session_that_closes_slowly_is_left_at_once_by_its_peers(
 async def test_a_session_that_closes_slowly_frees_its_port_for_the_next(
     silent: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(zenoh_mesh, "CLOSE_TIMEOUT", 1.5)
+    monkeypatch.setattr(zenoh_mesh, "CLOSE_TIMEOUT", 0.6)
     fleet = connecting(default_fleet(), "localhost", silent)  # a name, so its connections are unknown
     port = free_port("127.0.0.1", 0)
     fleet = replace(fleet, mesh=replace(fleet.mesh, listen=(f"tcp/127.0.0.1:{port}",)))

@@ -6,10 +6,12 @@ middle, lets an attempt last 10 s, in which all links of the session stand, and 
 
 from __future__ import annotations
 
+import atexit
 import os
 import re
 import socket
 import threading
+import time
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from typing import Any, Final, Protocol, TypeAlias
@@ -19,6 +21,8 @@ import zenoh
 
 CLOSE_SOON_S: Final = 0.25
 """Seconds after which a session that is being closed loses its sockets."""
+ZENOHS_CLOSE_S: Final = 11.0
+"""Seconds after which Zenoh has given up to close a session."""
 _LOCATOR: Final = re.compile(r"[a-z]+/\[?(?P<ip>[0-9a-f.:]+)\]?:(?P<port>[0-9]+)(?:[?#].*)?")
 
 Address: TypeAlias = tuple[str, int]
@@ -43,6 +47,8 @@ class Sessions:
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._open: list[zenoh.Session] = []
+        self._closing: set[threading.Thread] = set()
+        atexit.register(self._wait)
 
     def open(self, settings: zenoh.Config) -> zenoh.Session:
         """Raises ZError."""
@@ -67,6 +73,7 @@ class Sessions:
         attempts = {address(endpoint) for endpoint in sought} - {NOWHERE}
         ports = {address(endpoint)[1] for endpoint in listening} - {0}
         closing = threading.Thread(target=close, name="closes a session", daemon=True)
+        self._closing.add(closing)
         closing.start()
         closing.join(CLOSE_SOON_S)
         while closing.is_alive():  # others may link to it as long as it listens
@@ -81,8 +88,16 @@ class Sessions:
 
             shut(goes)
             closing.join(CLOSE_SOON_S)
+        self._closing.discard(closing)
         if errors:
             raise errors[0]
+
+    def _wait(self) -> None:
+        """Wait until no session is being closed: a thread that comes back from Zenoh while Python ends aborts the
+        process."""
+        until = time.monotonic() + ZENOHS_CLOSE_S
+        for closing in list(self._closing):
+            closing.join(max(0.0, until - time.monotonic()))
 
 
 SESSIONS: Final = Sessions()
