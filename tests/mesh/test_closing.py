@@ -20,7 +20,7 @@ from tests.mesh.both_meshes import ASK, LONG, NEWS, Ping, Pong, World, token
 from tests.mesh.kit import until
 from zscout.config.fleet import Fleet, MeshConfig, default_fleet
 from zscout.keyexpr import Role, Sender
-from zscout.mesh import MeshError, ZenohMesh, zenoh_mesh
+from zscout.mesh import MeshError, ZenohMesh, links, zenoh_mesh
 from zscout.ports import free_port
 
 
@@ -172,6 +172,7 @@ async def test_a_session_that_closes_slowly_is_left_at_once_by_its_peers(
     silent: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(zenoh_mesh, "CLOSE_TIMEOUT", 1.0)
+    monkeypatch.setattr(links, "LINKS_END_S", 0.1)
     fleet = connecting(default_fleet(), "localhost", silent)  # a name, so its connections are unknown
     async with await ZenohMesh.open(fleet, Sender("a", "stays")) as stays:
         leaves = await ZenohMesh.open(fleet, Sender("a", "leaves"))

@@ -20,7 +20,9 @@ import psutil
 import zenoh
 
 CLOSE_SOON_S: Final = 0.25
-"""Seconds after which a session that is being closed loses its sockets."""
+"""Seconds after which a session that is being closed loses its listeners and its attempts to connect."""
+LINKS_END_S: Final = 1.0
+"""Seconds after which it loses its links. On a busy host its last messages may take a while."""
 ZENOHS_CLOSE_S: Final = 11.0
 """Seconds after which Zenoh has given up to close a session."""
 _LOCATOR: Final = re.compile(r"[a-z]+/\[?(?P<ip>[0-9a-f.:]+)\]?:(?P<port>[0-9]+)(?:[?#].*)?")
@@ -59,7 +61,7 @@ class Sessions:
 
     def close(self, session: zenoh.Session, sought: Iterable[str] = (), listening: Iterable[str] = ()) -> None:
         """Close a session. It may be trying to connect to the endpoints `sought`; at `listening` only it may listen.
-        Blocks, for up to 10 s if it tries to connect elsewhere; its links end after CLOSE_SOON_S. Raises ZError."""
+        Blocks, for up to 10 s if it tries to connect elsewhere; its links end after LINKS_END_S. Raises ZError."""
         errors = list[zenoh.ZError]()
 
         def close() -> None:
@@ -75,9 +77,10 @@ class Sessions:
         closing = threading.Thread(target=close, name="closes a session", daemon=True)
         self._closing.add(closing)
         closing.start()
+        began = time.monotonic()
         closing.join(CLOSE_SOON_S)
         while closing.is_alive():  # others may link to it as long as it listens
-            own = _links(session)
+            own = _links(session) if time.monotonic() - began >= LINKS_END_S else set()
             with self._lock:
                 kept = {link for other in self._open for link in _links(other)}
 
