@@ -202,7 +202,7 @@ class Relinking:
                     log.info("linked again: %s", ", ".join(sorted(peers)))
                     return
         finally:
-            SESSIONS.close(temporary, addresses)
+            SESSIONS.close(temporary)  # its attempts go to addresses to which others of this process connect as well
 
 
 def _listens(addresses: Sequence[str]) -> bool | None:
