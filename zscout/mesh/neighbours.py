@@ -2,8 +2,8 @@
 
 Each session listens on loopback, and publishes its port in the name of an abstract Linux socket. The kernel lists these
 names, removes them with their process, and keeps them apart for each network namespace, as it does loopback. A new
-session connects to the sessions that it finds. Where multicast or gossip was first, and linked the two by a network
-address, that link is shut down: it would end with the address. Like an answer to multicast, a name grants no rights:
+session connects to the sessions that it finds. Where multicast was first, and linked the two by a network address, the
+new session ends that link: it would end with the address. Like an answer to multicast, a name grants no rights:
 it only gives an address."""
 
 from __future__ import annotations
@@ -84,15 +84,6 @@ class Meeting:
             elif len(found) >= wanted:
                 return
             time.sleep(POLL_S)
-
-    def is_detour(self, peer: str, link: Link) -> bool:
-        """Return True for a link to the session `peer` of a neighbour by a network address of this host."""
-        if not is_local(link) or ipaddress.ip_address(ends(link)[0][0]).is_loopback:
-            return False
-        known = [at for at, _ in _published(self._name)]
-        # The newer of both makes the link by loopback, if the older is among those to which it connects.
-        there = [at for at in known if peer.endswith(time_in_id(at))]
-        return any(min(at, self.at) in known[:MAX_NEIGHBOURS] for at in there)
 
     def release_port(self) -> None:
         """Close the reserving socket: Zenoh listens on the port now."""

@@ -11,7 +11,7 @@ import re
 import secrets
 import threading
 import time
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Future
 from contextlib import suppress
@@ -33,7 +33,7 @@ from zscout.keyexpr import FleetMember, Keys, Sender, access_control
 from zscout.logs import shortage
 from zscout.mesh import interfaces
 from zscout.mesh.exchange import SPAWN, MeshError
-from zscout.mesh.links import SESSIONS, ends, shut
+from zscout.mesh.links import SESSIONS
 from zscout.mesh.neighbours import Meeting, time_in_id
 from zscout.mesh.relinking import TEMPORARY_ID, Relinking
 from zscout.mesh.renewal import RenewableTransport
@@ -63,7 +63,6 @@ QUALITIES: dict[Quality, dict[str, Any]] = {
     Quality.FRAME: {"congestion_control": DROP, "priority": zenoh.Priority.DATA, "express": True},
 }
 QUERY: Any = {"target": zenoh.QueryTarget.ALL, "consolidation": zenoh.ConsolidationMode.NONE, **CONTROL}
-MAX_DETOURS = 3  # links to one neighbour by a network address that are shut down
 MAX_QUERIERS = 256  # per session: Zenoh never frees a key's declaration
 MAX_MESSAGE = 17_000_000  # bytes: a little more than zscout's largest message
 FILE_CHECK_PERIOD = 2.0  # seconds between two checks for renewed certificates and changed rights
@@ -412,24 +411,12 @@ class ZenohTransport(Transport):
         config: MeshConfig | None = None,
     ) -> None:
         self._session, self._relinking, self._meeting = session, relinking, meeting
-        self._detours = Counter[str]()
         self._sought, self._listening = ([], []) if config is None else ([*config.connect], [*config.listen])
         if meeting is not None:
             self._sought += meeting.others
             self._listening.append(meeting.endpoint)
-            self._listener = session.info.declare_link_events_listener(_direct(self._on_link), history=True)
         self._queriers: dict[tuple[str, float], zenoh.Querier] = {}  # by key and timeout
         self._asked_once: dict[tuple[str, float], None] = {}
-
-    def _on_link(self, event: zenoh.LinkEvent) -> None:
-        """Shut down a link to a neighbour by a network address: by loopback it outlasts the address."""
-        peer, made = str(event.link.zid), event.kind == zenoh.SampleKind.PUT
-        if made and self._meeting is not None and self._meeting.is_detour(peer, event.link):
-            self._detours[peer] += 1
-            if self._detours[peer] > MAX_DETOURS:  # it seems to be out of reach by loopback
-                return
-            detour = ends(event.link)
-            shut(lambda here, there: (here, there) == detour)
 
     def id(self) -> str:
         return str(self._session.info.zid())
