@@ -153,7 +153,7 @@ def silent(request: pytest.FixtureRequest) -> Iterator[int]:
 
 
 def connecting(fleet: Fleet, host: str, port: int) -> Fleet:
-    return replace(fleet, mesh=MeshConfig(multicast=False, connect=(f"tcp/{host}:{port}",)))
+    return replace(fleet, mesh=MeshConfig(multicast=False, lease=5, connect=(f"tcp/{host}:{port}",)))
 
 
 @pytest.mark.real_time
@@ -171,7 +171,7 @@ async def test_a_frozen_process_that_is_sought_holds_up_nobody_who_leaves(
 async def test_a_session_that_closes_slowly_is_left_at_once_by_its_peers(
     silent: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(zenoh_mesh, "CLOSE_TIMEOUT", 1.0)
+    monkeypatch.setattr(zenoh_mesh, "CLOSE_TIMEOUT", 2.0)
     monkeypatch.setattr(links, "LINKS_END_S", 0.1)
     fleet = connecting(default_fleet(), "localhost", silent)  # a name, so its connections are unknown
     async with await ZenohMesh.open(fleet, Sender("a", "stays")) as stays:
