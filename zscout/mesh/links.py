@@ -24,7 +24,7 @@ CLOSE_SOON_S: Final = 0.25
 LINKS_END_S: Final = 1.0
 """Seconds after which it loses its links. On a busy host its last messages may take a while."""
 ZENOHS_CLOSE_S: Final = 11.0
-"""Seconds after which Zenoh has given up to close a session."""
+"""Seconds after which Zenoh gives up closing a session, and a second more."""
 _LOCATOR: Final = re.compile(r"[a-z]+/\[?(?P<ip>[0-9a-f.:]+)\]?:(?P<port>[0-9]+)(?:[?#].*)?")
 
 Address: TypeAlias = tuple[str, int]
@@ -60,7 +60,7 @@ class Sessions:
         return session
 
     def close(self, session: zenoh.Session, sought: Iterable[str] = (), listening: Iterable[str] = ()) -> None:
-        """Close a session. It may be trying to connect to the endpoints `sought`; at `listening` only it may listen.
+        """Close a session. It may be trying to connect to the endpoints `sought`, and alone has the ports of `listening`.
         Blocks, for up to 10 s if it tries to connect elsewhere; its links end after LINKS_END_S. Raises ZError."""
         errors = list[zenoh.ZError]()
 

@@ -44,7 +44,6 @@ class Meeting:
 
     def __init__(self, fleet: str, mesh: MeshConfig, protocol: str) -> None:
         meeting = hashlib.sha256(" ".join([fleet, *mesh.known_by]).encode()).hexdigest()[:16]
-        self._name = f"zscout-mesh-{meeting}-{protocol}"
         self._reserved = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
         self._published = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
         try:
@@ -54,8 +53,8 @@ class Meeting:
             port, self.at = self._reserved.getsockname()[1], time.time_ns()
             self.endpoint = f"{protocol}/127.0.0.1:{port}"
             # Publish before listing: of two sessions that start together at least one finds the other.
-            self._published.bind(f"\0{self._name}-{port}-{self.at}")
-            older = [(at, port) for at, port in _published(self._name) if at < self.at][:MAX_NEIGHBOURS]
+            self._published.bind(f"\0zscout-mesh-{meeting}-{protocol}-{port}-{self.at}")
+            older = _older(meeting, protocol, self.at)
             self.others = [f"{protocol}/127.0.0.1:{port}{_RETRY}" for _, port in older]
             self._young = {port for at, port in older if self.at - at < YOUNG}
         except OSError:
@@ -94,18 +93,13 @@ class Meeting:
         self._published.close()
 
 
-def time_in_id(at: int) -> str:
-    """The last digits of the id of a session that was published at `at`, in ns since 1970."""
-    return at.to_bytes(8, "little").hex()[4:]
-
-
-def _published(name: str) -> list[tuple[int, int]]:
-    """Times and ports of all sessions that are published under a name, the oldest first."""
-    pattern = re.compile(rf"@{name}-(\d{{1,5}})-(\d{{1,19}})$", re.ASCII | re.MULTILINE)
+def _older(meeting: str, protocol: str, before: int) -> list[tuple[int, int]]:
+    """Times and ports of older neighbours, the oldest first: of two sessions the newer one makes the link."""
+    name = re.compile(rf"@zscout-mesh-{meeting}-{protocol}-(\d{{1,5}})-(\d{{1,20}})$", re.ASCII | re.MULTILINE)
     found = list[tuple[int, int]]()
     with suppress(OSError):
-        found = [(int(at), int(port)) for port, at in pattern.findall(_NAMES.read_text(errors="replace"))]
-    return sorted((at, port) for at, port in found if 0 < port < 65_536)
+        found = [(int(at), int(port)) for port, at in name.findall(_NAMES.read_text(errors="replace"))]
+    return sorted((at, port) for at, port in found if at < before and 0 < port < 65_536)[:MAX_NEIGHBOURS]
 
 
 def _listening() -> set[int]:

@@ -34,7 +34,7 @@ from zscout.logs import shortage
 from zscout.mesh import interfaces
 from zscout.mesh.exchange import SPAWN, MeshError
 from zscout.mesh.links import SESSIONS
-from zscout.mesh.neighbours import Meeting, time_in_id
+from zscout.mesh.neighbours import Meeting
 from zscout.mesh.relinking import TEMPORARY_ID, Relinking
 from zscout.mesh.renewal import RenewableTransport
 from zscout.mesh.session import Mesh
@@ -284,7 +284,8 @@ def _security(fleet: Fleet, keys: Keys, me: Sender) -> Security:
 def increasing_id(at: int | None = None) -> str:
     """A session id greater than all earlier ones, so that the newer session makes the links. `at`: its time, in ns
     since 1970; None: now. Zenoh compares ids from the last byte on, and prints them as a number."""
-    return f"1{secrets.token_hex(9)}0{time_in_id(time.time_ns() if at is None else at)}"
+    time_ns = time.time_ns() if at is None else at
+    return f"1{secrets.token_hex(9)}0{time_ns.to_bytes(8, 'little').hex()[4:]}"
 
 
 def check_room(files: int = SESSION_FILES, threads: int = SESSION_THREADS) -> None:
