@@ -60,8 +60,9 @@ class Sessions:
         return session
 
     def close(self, session: zenoh.Session, sought: Iterable[str] = (), listening: Iterable[str] = ()) -> None:
-        """Close a session. It may be trying to connect to the endpoints `sought`, and alone has the ports of `listening`.
-        Blocks, for up to 10 s if it tries to connect elsewhere; its links end after LINKS_END_S. Raises ZError."""
+        """Close a session. It may be trying to connect to the endpoints `sought`, and alone has the ports of
+        `listening`. Blocks, for up to 10 s if it tries to connect elsewhere; its links end after LINKS_END_S. Raises
+        ZError."""
         errors = list[zenoh.ZError]()
 
         def close() -> None:
