@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 
 from zscout.behaviors.perception.outline import Mask, Outlines
 from zscout.behaviors.perception.presence import Presence
-from zscout.behaviors.perception.rain import Rain
+from zscout.behaviors.perception.rain import Rain, labelled
 from zscout.messages import MotionLimits
 
 WIDTH: Final = 160  # columns of the analysed picture; larger ones are reduced to it
@@ -87,6 +87,8 @@ STIRS_SMALL: Final = 0.1  # least share of so small a region that changes betwee
 MEMORY: Final = 1.2  # seconds after which an earlier sighting confirms nothing
 MAX_BOXES: Final = 16
 GAP: Final = 1.0  # seconds without motion that end an event
+
+_THICK, _JOINED, _NEXT, _RIM = (np.ones(size, np.uint8) for size in ((3, 2), (7, 5), (15, 25), (5, 5)))
 
 Picture = NDArray[np.uint8]
 _Plane = NDArray[np.float32]
@@ -389,16 +391,14 @@ class MotionDetector:
         """Regions of pixels above WEAK, some above STRONG."""
         weak = (score > WEAK).astype(np.uint8)
         # Torn lines and hot pixels are thinner than anything that moves.
-        thick = np.asarray(cv2.morphologyEx(weak, cv2.MORPH_OPEN, np.ones((3, 2), np.uint8)), np.uint8)
+        thick = np.asarray(cv2.morphologyEx(weak, cv2.MORPH_OPEN, _THICK), np.uint8)
         thick = self._rain.without_drops(time, thick, SMALLEST * thick.size)
-        if not thick.any():
+        if not cv2.countNonZero(thick):
             none = np.zeros(0, np.bool_)
             return _Moving(thick, thick.astype(np.int32), np.zeros((0, 5), np.int32), none, none)
-        weak = np.asarray(cv2.morphologyEx(thick, cv2.MORPH_CLOSE, np.ones((7, 5), np.uint8)), np.uint8)
-        count, marked, found, _ = cv2.connectedComponentsWithStats(weak, connectivity=8)
-        labels: NDArray[np.int32] = np.asarray(marked, np.int32)
-        stats: _Regions = np.asarray(found, np.int32)
-        strong = np.bincount(labels[score > STRONG], minlength=count)
+        weak = np.asarray(cv2.morphologyEx(thick, cv2.MORPH_CLOSE, _JOINED), np.uint8)
+        labels, stats, _ = labelled(weak)
+        strong = np.bincount(labels[score > STRONG], minlength=len(stats))
         area = stats[:, cv2.CC_STAT_AREA]
         keep = (area >= self._smallest * score.size) & (strong >= 0.15 * area)
         # A thin band along the lines is a transmission fault.
@@ -418,16 +418,17 @@ class MotionDetector:
         """Return True if recent sightings nearby confirm this sighting."""
         mask = found.mask
         agree, fresh, before = 0, np.zeros_like(mask), np.zeros_like(mask)
-        if np.any(mask):
+        moves = bool(found.kept.any())
+        if moves:
             for at, earlier, whole, then in self._sightings:
-                if time - at <= MEMORY and np.any(whole):
+                if time - at <= MEMORY and cv2.countNonZero(whole):
                     moving = found.while_changing(level - then, noise)
-                    agree += bool(np.any(earlier & _around(moving)))
+                    agree += bool(cv2.countNonZero(earlier & _around(moving)))
                     fresh, before = fresh | moving, before | whole
             fresh |= mask & ~_around(before)
         # A region that does not move can't confirm later sightings either.
         self._sightings.append((time, fresh, mask, level))
-        return bool(np.any(mask)) and 1 + agree >= (SURE if self._rain.drops is None else RECENT)
+        return moves and 1 + agree >= (SURE if self._rain.drops is None else RECENT)
 
 
 def _of_regions(labels: NDArray[np.int32], wanted: NDArray[np.bool_]) -> NDArray[np.uint8]:
@@ -437,11 +438,11 @@ def _of_regions(labels: NDArray[np.int32], wanted: NDArray[np.bool_]) -> NDArray
 
 def _around(mask: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Return the area in which the next sighting of the same motion may be."""
-    return np.asarray(cv2.dilate(mask, np.ones((15, 25), np.uint8)), np.uint8)
+    return np.asarray(cv2.dilate(mask, _NEXT), np.uint8)
 
 
 def _with_rim(mask: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    return np.asarray(cv2.dilate(mask, np.ones((5, 5), np.uint8)), np.uint8)
+    return np.asarray(cv2.dilate(mask, _RIM), np.uint8)
 
 
 def _fitted(box: Box, mask: Mask) -> Box:
@@ -571,7 +572,8 @@ def _bands(grey: _Plane, mean: _Plane, gain: float, offset: float, hidden: NDArr
     if without < FAINT:
         return None
     # Moving things seldom fill half of a line's stripes.
-    middle = np.median(now / np.maximum(was, np.float32(DARK)), axis=1)
+    gains = np.sort(now / np.maximum(was, np.float32(DARK)), axis=1)
+    middle = (gains[:, STRIPES // 2 - 1] + gains[:, STRIPES // 2]) / 2
     light = np.asarray(cv2.blur(middle, (1, 5)), np.float32).reshape(-1, 1)
     bands = light / max(0.1, float(light.mean()))
     if bands.max() > BANDED or bands.min() < 1 / BANDED or _median(np.abs(now - light * was)[shown]) > 0.5 * without:
@@ -581,18 +583,28 @@ def _bands(grey: _Plane, mean: _Plane, gain: float, offset: float, hidden: NDArr
 
 def _torn(lines: _Plane, mean: _Plane) -> bool:
     """Return True if some lines match the background only when displaced."""
-    columns = lines.shape[1]
+    rows, columns = lines.shape
     most = min(ASIDE, columns // 2) - 1
-    here, there = lines.astype(np.float64), np.pad(mean.astype(np.float64), ((0, 0), (most, most)))
+    offsets = np.arange(-most, most + 1)
+    here = lines.astype(np.float64)
+    there = np.zeros((rows, columns + 2 * most))
+    there[:, most:-most] = mean
     # The square of a difference, summed over the columns that overlap: of both squares, and of twice the product.
     product = np.einsum("rdx,rx->rd", np.lib.stride_tricks.sliding_window_view(there, columns, axis=1), here)
-    shown = np.lib.stride_tricks.sliding_window_view(np.pad(np.ones(columns), most), columns)
-    squares = (here * here) @ shown.T
-    squares += np.lib.stride_tricks.sliding_window_view(there * there, columns, axis=1).sum(axis=2)
-    aside = (squares - 2 * product) / shown.sum(axis=1)
+    sums, of_mean = _up_to(here), _up_to(there)
+    squares = sums[:, np.minimum(columns, columns - offsets)] - sums[:, np.maximum(0, -offsets)]
+    squares += of_mean[:, columns:] - of_mean[:, : 2 * most + 1]
+    aside = (squares - 2 * product) / (columns - np.abs(offsets))
     still = aside[:, most].sum()
     aside[:, (most - 1, most + 1)] = np.inf
     return bool(aside.min(axis=1).sum() < 0.5 * still)
+
+
+def _up_to(lines: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The sum of squares of the first 0, 1, 2 ... columns."""
+    sums = np.zeros((lines.shape[0], lines.shape[1] + 1))
+    np.cumsum(lines * lines, axis=1, out=sums[:, 1:])
+    return sums
 
 
 class EventTracker:

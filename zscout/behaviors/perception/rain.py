@@ -39,14 +39,14 @@ class Rain:
         if OFTEN < passed < math.inf:
             self.pictures = 0
             return regions
-        if not regions.any():
+        if not cv2.countNonZero(regions):
             self.pictures, self.drops = 0, regions if time <= self._until else None
             return regions
-        count, labels, stats, middles = cv2.connectedComponentsWithStats(regions, connectivity=8)
+        labels, stats, middles = labelled(regions)
         area = stats[:, cv2.CC_STAT_AREA]
-        lasts = np.zeros(count, np.intp)
+        lasts = np.zeros(len(area), np.intp)
         if before is not None and before.shape == regions.shape:
-            lasts = np.bincount(labels[before > 0], minlength=count)
+            lasts = np.bincount(labels[before > 0], minlength=len(area))
         counts = area >= DROP
         counts[0] = False
         fresh = counts & (lasts < LASTS * area)
@@ -62,6 +62,13 @@ class Rain:
         drop = float(np.median(area[fresh])) if places else 0.0
         moves = (lasts >= max(smallest, drop)) & (area >= LARGER * drop) | (area >= max(smallest, MUCH_LARGER * drop))
         moves[0] = False
-        moving = moves.astype(np.uint8).take(np.asarray(labels, np.int32))
+        moving = moves.astype(np.uint8).take(labels)
         self.drops = regions - moving
         return moving
+
+
+def labelled(regions: Regions) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.float64]]:
+    """The connected region of each pixel, 0 outside; each region's left, top, width, height and area; its middle."""
+    # On pictures of 160 columns, OpenCV's default algorithm takes more than twice as long.
+    _, labels, stats, middles = cv2.connectedComponentsWithStatsWithAlgorithm(regions, 8, cv2.CV_32S, cv2.CCL_GRANA)
+    return np.asarray(labels, np.int32), np.asarray(stats, np.int32), np.asarray(middles, np.float64)
