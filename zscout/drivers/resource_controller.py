@@ -443,7 +443,7 @@ class ResourceController:
         sender = self.mesh.keys.sender_of(query.key)
         if self._is_stale(query):
             waited = f"{self._waited(query) / SECOND:.2f} s"
-            raise Refused("stale", f"the command waited {waited}, longer than its ttl {command.ttl:g} s")
+            raise Refused("stale", f"the command waited {waited}, longer than its ttl {command.ttl:g} s; send it again")
         if command.grant is None:
             return await self.driver.command_without_grant(sender, command.do)
         if (name := command.do.get("name")) in ("leaving", "left"):

@@ -205,7 +205,7 @@ class RobotDriver(Driver):
         if self._stopped_at is not None and self._stopped_at <= self._mesh.now():
             return
         self._counts["dead_man_stops"] += 1
-        self._drop(Refused("stale", "the command waited too long for the radio"), commands.RadioDrive)
+        self._drop(Refused("stale", "the command waited too long for the radio; send it again"), commands.RadioDrive)
         self._stopped_at = 0
         self._rc.supervisor.spawn(self._send_urgent(commands.RadioStop(self._id, self._rc.name), HALT_TRIES))
 

@@ -181,7 +181,7 @@ class ComponentHost:
         check_name(start.component, "component")
         kinds = self._rules.kinds
         if not self._rules.allow:
-            raise Refused("not_allowed", "this host starts no components: [components] allow is false")
+            raise Refused("not_allowed", "this host starts no components: its node file has [components] allow = false")
         if kinds is not None and start.spec.kind not in kinds:
             allowed = ", ".join(kinds) or "none"
             message = f"this host does not start kind {quoted(start.spec.kind)}; [components] kinds allows {allowed}"
