@@ -18,6 +18,7 @@ from msgspec.structs import replace
 from tests.mesh.kit import WITHIN, until
 from zscout.config.fleet import MeshConfig
 from zscout.mesh import relinking
+from zscout.mesh.relinking import Relinking
 from zscout.mesh.zenoh_mesh import ZenohTransport, _relinking, increasing_id, zenoh_config
 
 _PORT = re.compile(r":(\d+)(?:[?#].*)?$")
@@ -237,3 +238,19 @@ async def test_a_relay_is_not_looked_for(stack: AsyncExitStack, monkeypatch: pyt
     await until(lambda: _ends(here, there) - before)
     assert looked
     assert address not in looked
+
+
+async def test_a_link_by_a_network_that_a_neighbour_replaces_is_not_looked_for(stack: AsyncExitStack) -> None:
+    """It would be introduced, and linked by a network again."""
+    here = await _World(stack).peer()
+    neighbour, other = "1a", "2b"
+    config = zenoh_config(MeshConfig(multicast=False))
+    relinks = Relinking(here._session, config, lambda _: config, neighbour.__eq__)
+    stack.callback(relinks.close)
+    await until(lambda: relinks._thread is None)
+    looked: list[str] = []
+    relinks._begin = lambda *, greet: looked.extend(relinks._lost)  # type: ignore[method-assign]
+    for peer in (neighbour, other):
+        link = SimpleNamespace(zid=peer, src="tcp/[fd00::2]:1", dst="tcp/[fd00::2]:2")
+        relinks._on_link(SimpleNamespace(kind=zenoh.SampleKind.DELETE, link=link))  # type: ignore[arg-type]
+    assert looked == [other]

@@ -7,6 +7,7 @@ middle, lets an attempt last 10 s, in which all links of the session stand, and 
 from __future__ import annotations
 
 import atexit
+import ipaddress
 import os
 import re
 import socket
@@ -34,7 +35,10 @@ NOWHERE: Final[Address] = ("", 0)
 
 
 class Link(Protocol):
-    """A link of a session, by the endpoints of both ends."""
+    """A link of a session, by the endpoints of both ends and the id of the other session."""
+
+    @property
+    def zid(self) -> object: ...
 
     @property
     def src(self) -> object: ...
@@ -123,10 +127,10 @@ def ends(link: Link) -> Ends:
     return address(link.src), address(link.dst)
 
 
-def is_local(link: Link) -> bool:
-    """Return True for a link within this host."""
+def by_network(link: Link) -> bool:
+    """Return True for a link within this host by a network address: it ends with that address."""
     (here, _), (there, _) = ends(link)
-    return here == there != ""
+    return here == there != "" and not ipaddress.ip_address(here).is_loopback
 
 
 def shut(chosen: Callable[[Address, Address], bool]) -> None:

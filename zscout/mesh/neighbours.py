@@ -9,7 +9,6 @@ it only gives an address."""
 from __future__ import annotations
 
 import hashlib
-import ipaddress
 import re
 import socket
 import time
@@ -19,7 +18,7 @@ from pathlib import Path
 from typing import Final
 
 from zscout.config.fleet import MeshConfig
-from zscout.mesh.links import Link, ends, is_local, shut
+from zscout.mesh.links import Link, by_network, ends, shut
 from zscout.types import SECOND
 
 MAX_NEIGHBOURS: Final = 64
@@ -54,9 +53,14 @@ class Meeting:
             self.endpoint = f"{protocol}/127.0.0.1:{port}"
             # Publish before listing: of two sessions that start together at least one finds the other.
             self._published.bind(f"\0zscout-mesh-{meeting}-{protocol}-{port}-{self.at}")
-            older = _older(meeting, protocol, self.at)
+            self._name = re.compile(
+                rf"@zscout-mesh-{meeting}-{protocol}-(\d{{1,5}})-(\d{{1,20}})$", re.ASCII | re.MULTILINE
+            )
+            # Of two sessions the newer one makes the link.
+            older = [(at, port) for at, port in self._neighbours() if at < self.at]
             self.others = [f"{protocol}/127.0.0.1:{port}{_RETRY}" for _, port in older]
-            self._young = {port for at, port in older if self.at - at < YOUNG}
+            self._older = {time_in_id(at) for at, _ in older}
+            self._young = {time_in_id(at): port for at, port in older if self.at - at < YOUNG}
         except OSError:
             self.close()
             raise
@@ -64,25 +68,37 @@ class Meeting:
     def wait_for_others(self) -> None:
         """Wait until the neighbours listen that were opened at about the same time. Blocks LISTEN_TIMEOUT_S at most."""
         tries = round(LISTEN_TIMEOUT_S / POLL_S) if self._young else 0
-        while tries and not self._young <= _listening():
+        while tries and not set(self._young.values()) <= _listening():
             tries -= 1
             time.sleep(POLL_S)
 
     def relink(self, links: Callable[[], Iterable[Link]]) -> None:
-        """End the links of a new session by network addresses of this host, if neighbours have no link by loopback:
-        Zenoh tries these again soon, and has nothing to lose yet. Blocks RELINK_TIMEOUT_S at most."""
-        others = {endpoint.partition("#")[0] for endpoint in self.others}
-        # Those of the same moment may not be linked yet.
-        wanted = len(others) if self._young else 0
+        """End the links of a new session to older neighbours by network addresses: Zenoh soon tries loopback again, and
+        has nothing to lose yet. Blocks RELINK_TIMEOUT_S at most, while such a link stands or a neighbour of the same
+        moment is not linked yet."""
+        young = set(self._young)
         for _ in range(round(RELINK_TIMEOUT_S / POLL_S)):
-            found = [link for link in links() if is_local(link)]
-            outside = {both for both in map(ends, found) if not ipaddress.ip_address(both[0][0]).is_loopback}
-            if outside and not others <= {str(link.dst) for link in found}:
-                wanted = max(wanted, len(found))
-                shut(lambda here, there, outside=outside: (here, there) in outside)  # type: ignore[misc]
-            elif len(found) >= wanted:
+            found = list(links())
+            wrong = {ends(link) for link in found if by_network(link) and _time_of(link.zid) in self._older}
+            young -= {_time_of(link.zid) for link in found if not by_network(link)}
+            if wrong:
+                shut(lambda here, there, wrong=wrong: (here, there) in wrong)  # type: ignore[misc]
+            elif not young:
                 return
             time.sleep(POLL_S)
+            # Those that ended get no link.
+            young = young and young & {time_in_id(at) for at, _ in self._neighbours()}
+
+    def is_neighbour(self, peer: object) -> bool:
+        """Return True for the id of a session that lives on this host, and is linked to this one by loopback."""
+        return _time_of(peer) in {time_in_id(at) for at, _ in self._neighbours()}
+
+    def _neighbours(self) -> list[tuple[int, int]]:
+        """Times and ports of the published sessions, this one too, the oldest first."""
+        found = list[tuple[int, int]]()
+        with suppress(OSError):
+            found = [(int(at), int(port)) for port, at in self._name.findall(_NAMES.read_text(errors="replace"))]
+        return sorted((at, port) for at, port in found if at < 1 << 64 and 0 < port < 65_536)[:MAX_NEIGHBOURS]
 
     def release_port(self) -> None:
         """Close the reserving socket: Zenoh listens on the port now."""
@@ -93,13 +109,13 @@ class Meeting:
         self._published.close()
 
 
-def _older(meeting: str, protocol: str, before: int) -> list[tuple[int, int]]:
-    """Times and ports of older neighbours, the oldest first: of two sessions the newer one makes the link."""
-    name = re.compile(rf"@zscout-mesh-{meeting}-{protocol}-(\d{{1,5}})-(\d{{1,20}})$", re.ASCII | re.MULTILINE)
-    found = list[tuple[int, int]]()
-    with suppress(OSError):
-        found = [(int(at), int(port)) for port, at in name.findall(_NAMES.read_text(errors="replace"))]
-    return sorted((at, port) for at, port in found if at < before and 0 < port < 65_536)[:MAX_NEIGHBOURS]
+def time_in_id(at: int) -> str:
+    """The end of the id of a session with this time, in ns since 1970, which orders ids by time (`increasing_id`)."""
+    return at.to_bytes(8, "little").hex()[4:]
+
+
+def _time_of(peer: object) -> str:
+    return str(peer)[-12:]
 
 
 def _listening() -> set[int]:

@@ -22,7 +22,7 @@ from typing import Any, Final
 import zenoh
 from zenoh.handlers import Callback
 
-from zscout.mesh.links import SESSIONS
+from zscout.mesh.links import SESSIONS, by_network
 
 log = logging.getLogger(__name__)
 
@@ -53,12 +53,19 @@ class _Lost:
 class Relinking:
     """Restores the links of one session, in a thread that runs while a link is lost.
 
-    `scouting`: settings for finding peers; `meeting`: for a temporary session with only the given addresses."""
+    `scouting`: settings for finding peers; `meeting`: for a temporary session with only the given addresses;
+    `is_neighbour`: True for ids of sessions that link to this one by loopback: introduced, they would link by network
+    addresses."""
 
     def __init__(
-        self, session: zenoh.Session, scouting: zenoh.Config, meeting: Callable[[Sequence[str]], zenoh.Config]
+        self,
+        session: zenoh.Session,
+        scouting: zenoh.Config,
+        meeting: Callable[[Sequence[str]], zenoh.Config],
+        is_neighbour: Callable[[str], bool] = lambda _: False,
     ) -> None:
         self._session, self._scouting, self._meeting = session, scouting, meeting
+        self._is_neighbour = is_neighbour
         self._own = str(session.zid())
         self._lock = threading.Lock()
         self._lost: dict[str, _Lost] = {}
@@ -94,6 +101,8 @@ class Relinking:
 
     def _on_link(self, event: zenoh.LinkEvent) -> None:
         now, peer = time.monotonic(), str(event.link.zid)
+        if event.kind == zenoh.SampleKind.DELETE and by_network(event.link) and self._is_neighbour(peer):
+            return  # a link by loopback replaces it, or exists already
         with self._lock:
             if event.kind == zenoh.SampleKind.PUT or self._closed.is_set() or peer.startswith(TEMPORARY_ID):
                 return  # `_try_all` sees new links: they may vanish without another event
@@ -120,7 +129,7 @@ class Relinking:
             log.debug("looking for peers failed: %s", error)
             return
         with self._lock:
-            for peer in found.keys() - {self._own}:
+            for peer in (peer for peer in found.keys() - {self._own} if not self._is_neighbour(peer)):
                 self._lost.setdefault(peer, _Lost(time.monotonic(), together=True))
 
     def _run(self, greet: bool) -> None:
