@@ -90,11 +90,11 @@ class Meeting:
             young = young and young & {time_in_id(at) for at, _ in self._neighbours()}
 
     def is_neighbour(self, peer: object) -> bool:
-        """Return True for the id of a session that lives on this host, and is linked to this one by loopback."""
+        """Return True for the id of a session of this host to which a link by loopback exists, or will."""
         return _time_of(peer) in {time_in_id(at) for at, _ in self._neighbours()}
 
     def _neighbours(self) -> list[tuple[int, int]]:
-        """Times and ports of the published sessions, this one too, the oldest first."""
+        """Times and ports of all sessions with names, its own too, the oldest first."""
         found = list[tuple[int, int]]()
         with suppress(OSError):
             found = [(int(at), int(port)) for port, at in self._name.findall(_NAMES.read_text(errors="replace"))]

@@ -54,8 +54,8 @@ class Relinking:
     """Restores the links of one session, in a thread that runs while a link is lost.
 
     `scouting`: settings for finding peers; `meeting`: for a temporary session with only the given addresses;
-    `is_neighbour`: True for ids of sessions that link to this one by loopback: introduced, they would link by network
-    addresses."""
+    `is_neighbour`: True for ids of sessions that link to this session by loopback; an introduction would link them by
+    network addresses."""
 
     def __init__(
         self,
