@@ -50,6 +50,31 @@ def test_a_session_that_does_not_close_holds_up_neither_the_caller_nor_the_end_o
     session.released.set()
 
 
+def test_the_end_of_a_process_waits_for_who_closes_a_session(monkeypatch: pytest.MonkeyPatch) -> None:
+    looks, go_on = threading.Event(), threading.Event()
+
+    def own_links(_: object) -> set[links.Ends]:
+        looks.set()
+        go_on.wait(HANG)
+        return set()
+
+    monkeypatch.setattr(links, "_links", own_links)
+    monkeypatch.setattr(links, "CLOSE_SOON_S", 0.01)
+    monkeypatch.setattr(links, "LINKS_END_S", 0.0)
+    session: Any = StuckSession()
+    sessions = links.Sessions()
+    threading.Thread(target=sessions.close, args=[session], daemon=True).start()
+    assert looks.wait(HANG)
+    session.released.set()
+    ends = threading.Thread(target=sessions._wait, daemon=True)
+    ends.start()
+    ends.join(0.1)
+    assert ends.is_alive()
+    go_on.set()
+    ends.join(HANG)
+    assert not ends.is_alive()
+
+
 def test_a_caller_that_is_cancelled_while_it_leaves_has_the_session_closed() -> None:
     session: Any = StuckSession()
 
@@ -179,9 +204,8 @@ async def test_a_session_that_closes_slowly_is_left_at_once_by_its_peers(
         await until(lambda: stays.links() == leaves.links() == 1)
         session = leaves._transport.current
         leaving = asyncio.create_task(leaves.close())
-        await until(lambda: stays.links() == 0)
+        await until(lambda: stays.links() == session.links() == 0)
         assert not leaving.done()
-        assert session.links() == 0
         await leaving
 
 

@@ -13,8 +13,8 @@ import re
 import socket
 import threading
 import time
-from collections.abc import Callable, Iterable, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from typing import Any, Final, Protocol, TypeAlias
 
 import psutil
@@ -53,12 +53,15 @@ class Sessions:
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._open: list[zenoh.Session] = []
-        self._closing: set[threading.Thread] = set()
+        self._at_work: set[threading.Event] = set()
+        self._closed: zenoh.Session | None = None
+        """The last one that was closed, so that the thread that closes it does not free it: that calls Zenoh again."""
         atexit.register(self._wait)
 
     def open(self, settings: zenoh.Config) -> zenoh.Session:
         """Raises ZError."""
-        session = zenoh.open(settings)
+        with self._awaited():
+            session = zenoh.open(settings)
         with self._lock:
             self._open.append(session)
         return session
@@ -67,6 +70,11 @@ class Sessions:
         """Close a session. It may be trying to connect to the endpoints `sought`, and alone has the ports of
         `listening`. Blocks, for up to 10 s if it tries to connect elsewhere; its links end after LINKS_END_S. Raises
         ZError."""
+        with self._awaited():
+            self._close(session, sought, listening)
+            self._closed = session
+
+    def _close(self, session: zenoh.Session, sought: Iterable[str], listening: Iterable[str]) -> None:
         errors = list[zenoh.ZError]()
 
         def close() -> None:
@@ -80,7 +88,6 @@ class Sessions:
         attempts = {address(endpoint) for endpoint in sought} - {NOWHERE}
         ports = {address(endpoint)[1] for endpoint in listening} - {0}
         closing = threading.Thread(target=close, name="closes a session", daemon=True)
-        self._closing.add(closing)
         closing.start()
         began = time.monotonic()
         closing.join(CLOSE_SOON_S)
@@ -96,16 +103,25 @@ class Sessions:
 
             shut(goes)
             closing.join(CLOSE_SOON_S)
-        self._closing.discard(closing)
         if errors:
             raise errors[0]
 
+    @contextmanager
+    def _awaited(self) -> Iterator[None]:
+        """A thread that comes back from Zenoh while Python ends aborts the process: the end waits for it."""
+        ready = threading.Event()
+        self._at_work.add(ready)
+        try:
+            yield
+        finally:
+            self._at_work.discard(ready)
+            ready.set()
+
     def _wait(self) -> None:
-        """Wait until no session is being closed: a thread that comes back from Zenoh while Python ends aborts the
-        process."""
         until = time.monotonic() + ZENOHS_CLOSE_S
-        for closing in list(self._closing):
-            closing.join(max(0.0, until - time.monotonic()))
+        while self._at_work and (left := until - time.monotonic()) > 0:
+            for ready in list(self._at_work)[:1]:
+                ready.wait(left)
 
 
 SESSIONS: Final = Sessions()

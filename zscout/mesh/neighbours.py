@@ -31,7 +31,7 @@ YOUNG: Final = 2 * SECOND
 _NAMES: Final = Path("/proc/net/unix")
 _LISTENERS: Final = Path("/proc/net/tcp")
 _LISTENS: Final = re.compile(r"^ *\d+: 0100007F:([0-9A-F]{4}) \S+ 0A ", re.MULTILINE)
-_RETRY: Final = "#retry_period_init_ms=50;retry_period_max_ms=5000;retry_period_increase_factor=2"
+_RETRY: Final = "#retry_period_init_ms=10;retry_period_max_ms=5000;retry_period_increase_factor=2"
 """Retry seldom: Zenoh tries to reach an ended neighbour as long as this session lives."""
 
 
@@ -76,22 +76,24 @@ class Meeting:
         """End the links of a new session to older neighbours by network addresses: Zenoh soon tries loopback again, and
         has nothing to lose yet. Blocks RELINK_TIMEOUT_S at most, while such a link stands or a neighbour of the same
         moment is not linked yet."""
-        young = set(self._young)
+        waiting = set(self._young)
         for _ in range(round(RELINK_TIMEOUT_S / POLL_S)):
-            found = list(links())
-            wrong = {ends(link) for link in found if by_network(link) and _time_of(link.zid) in self._older}
-            young -= {_time_of(link.zid) for link in found if not by_network(link)}
+            found = {ends(link): (_time_of(link.zid), by_network(link)) for link in links()}
+            wrong = {both: peer for both, (peer, bad) in found.items() if bad and peer in self._older}
+            waiting = waiting.union(wrong.values()) - {peer for peer, bad in found.values() if not bad}
             if wrong:
                 shut(lambda here, there, wrong=wrong: (here, there) in wrong)  # type: ignore[misc]
-            elif not young:
+            elif not waiting:
                 return
             time.sleep(POLL_S)
             # Those that ended get no link.
-            young = young and young & {time_in_id(at) for at, _ in self._neighbours()}
+            waiting = waiting and waiting & {time_in_id(at) for at, _ in self._neighbours()}
 
     def is_neighbour(self, peer: object) -> bool:
-        """Return True for the id of a session of this host to which a link by loopback exists, or will."""
-        return _time_of(peer) in {time_in_id(at) for at, _ in self._neighbours()}
+        """Return True for the id of a session of this host if one of the two links to the published address of the
+        other, as long as both live."""
+        time = _time_of(peer)
+        return any(time_in_id(at) == time and (at > self.at or time in self._older) for at, _ in self._neighbours())
 
     def _neighbours(self) -> list[tuple[int, int]]:
         """Times and ports of all sessions with names, its own too, the oldest first."""
