@@ -31,7 +31,7 @@ YOUNG: Final = 2 * SECOND
 _NAMES: Final = Path("/proc/net/unix")
 _LISTENERS: Final = Path("/proc/net/tcp")
 _LISTENS: Final = re.compile(r"^ *\d+: 0100007F:([0-9A-F]{4}) \S+ 0A ", re.MULTILINE)
-_RETRY: Final = "#retry_period_init_ms=10;retry_period_max_ms=5000;retry_period_increase_factor=2"
+_RETRY: Final = "#retry_period_init_ms=50;retry_period_max_ms=5000;retry_period_increase_factor=2"
 """Retry seldom: Zenoh tries to reach an ended neighbour as long as this session lives."""
 
 
