@@ -75,6 +75,19 @@ def test_the_end_of_a_process_waits_for_who_closes_a_session(monkeypatch: pytest
     assert not ends.is_alive()
 
 
+def test_the_end_of_a_process_waits_for_who_frees_a_session() -> None:
+    freed = threading.Event()
+    closer = threading.Thread(target=freed.wait, args=[HANG], name=links.CLOSER, daemon=True)
+    closer.start()
+    ends = threading.Thread(target=links.Sessions()._wait, daemon=True)
+    ends.start()
+    ends.join(0.1)
+    assert ends.is_alive()
+    freed.set()
+    ends.join(HANG)
+    assert not ends.is_alive()
+
+
 def test_a_caller_that_is_cancelled_while_it_leaves_has_the_session_closed() -> None:
     session: Any = StuckSession()
 

@@ -32,6 +32,8 @@ Address: TypeAlias = tuple[str, int]
 Ends: TypeAlias = tuple[Address, Address]
 """The address and port of this end, and of the other end."""
 NOWHERE: Final[Address] = ("", 0)
+CLOSER: Final = "closes the mesh"
+"""Name of threads that close a session, and may be the last to refer to it."""
 
 
 class Link(Protocol):
@@ -54,8 +56,6 @@ class Sessions:
         self._lock = threading.Lock()
         self._open: list[zenoh.Session] = []
         self._at_work: set[threading.Event] = set()
-        self._closed: zenoh.Session | None = None
-        """The last one that was closed, so that the thread that closes it does not free it: that calls Zenoh again."""
         atexit.register(self._wait)
 
     def open(self, settings: zenoh.Config) -> zenoh.Session:
@@ -72,7 +72,6 @@ class Sessions:
         ZError."""
         with self._awaited():
             self._close(session, sought, listening)
-            self._closed = session
 
     def _close(self, session: zenoh.Session, sought: Iterable[str], listening: Iterable[str]) -> None:
         errors = list[zenoh.ZError]()
@@ -122,6 +121,10 @@ class Sessions:
         while self._at_work and (left := until - time.monotonic()) > 0:
             for ready in list(self._at_work)[:1]:
                 ready.wait(left)
+        # A thread that frees a session calls Zenoh too.
+        for thread in threading.enumerate():
+            if thread.name == CLOSER:
+                thread.join(max(0.0, until - time.monotonic()))
 
 
 SESSIONS: Final = Sessions()

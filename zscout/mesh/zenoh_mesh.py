@@ -33,7 +33,7 @@ from zscout.keyexpr import FleetMember, Keys, Sender, access_control
 from zscout.logs import shortage
 from zscout.mesh import interfaces
 from zscout.mesh.exchange import SPAWN, MeshError
-from zscout.mesh.links import SESSIONS
+from zscout.mesh.links import CLOSER, SESSIONS
 from zscout.mesh.neighbours import Meeting, time_in_id
 from zscout.mesh.relinking import TEMPORARY_ID, Relinking
 from zscout.mesh.renewal import RenewableTransport
@@ -356,7 +356,7 @@ async def _open(fleet: str, config: MeshConfig, security: Security | None) -> Tr
             met.close()
         # Close in a thread: this callback may run on the event loop's.
         opening.add_done_callback(
-            lambda opened: opened.exception() or in_thread("closes the mesh", lambda: SESSIONS.close(opened.result()))
+            lambda opened: opened.exception() or in_thread(CLOSER, lambda: SESSIONS.close(opened.result()))
         )
         raise
     if met is not None:
@@ -367,7 +367,7 @@ async def _open(fleet: str, config: MeshConfig, security: Security | None) -> Tr
         relinking = _relinking(session, config, security, met) if relinks else None
         return ZenohTransport(session, relinking, met, config)
     except BaseException:
-        in_thread("closes the mesh", functools.partial(SESSIONS.close, session))
+        in_thread(CLOSER, functools.partial(SESSIONS.close, session))
         raise
 
 
@@ -444,7 +444,7 @@ class ZenohTransport(Transport):
                 self._relinking.close()
             SESSIONS.close(self._session, self._sought, self._listening)
 
-        closing = in_thread("closes the mesh", close)
+        closing = in_thread(CLOSER, close)
         try:
             async with asyncio.timeout(CLOSE_TIMEOUT):
                 await asyncio.wrap_future(closing)
