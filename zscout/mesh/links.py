@@ -7,7 +7,6 @@ middle, lets an attempt last 10 s, in which all links of the session stand, and 
 from __future__ import annotations
 
 import atexit
-import ipaddress
 import os
 import re
 import socket
@@ -37,10 +36,7 @@ CLOSER: Final = "closes the mesh"
 
 
 class Link(Protocol):
-    """A link of a session, by the endpoints of both ends and the id of the other session."""
-
-    @property
-    def zid(self) -> object: ...
+    """A link of a session, by the endpoints of both ends."""
 
     @property
     def src(self) -> object: ...
@@ -146,10 +142,10 @@ def ends(link: Link) -> Ends:
     return address(link.src), address(link.dst)
 
 
-def by_network(link: Link) -> bool:
-    """Return True for a link within this host by a network address: it ends with that address."""
+def is_local(link: Link) -> bool:
+    """Return True for a link within this host."""
     (here, _), (there, _) = ends(link)
-    return here == there != "" and not ipaddress.ip_address(here).is_loopback
+    return here == there != ""
 
 
 def shut(chosen: Callable[[Address, Address], bool]) -> None:
