@@ -50,6 +50,16 @@ def test_a_session_that_does_not_close_holds_up_neither_the_caller_nor_the_end_o
     session.released.set()
 
 
+def assert_the_end_waits_for(event: threading.Event, sessions: links.Sessions) -> None:
+    ends = threading.Thread(target=sessions._wait, daemon=True)
+    ends.start()
+    ends.join(0.1)
+    assert ends.is_alive()
+    event.set()
+    ends.join(HANG)
+    assert not ends.is_alive()
+
+
 def test_the_end_of_a_process_waits_for_who_closes_a_session(monkeypatch: pytest.MonkeyPatch) -> None:
     looks, go_on = threading.Event(), threading.Event()
 
@@ -66,26 +76,14 @@ def test_the_end_of_a_process_waits_for_who_closes_a_session(monkeypatch: pytest
     threading.Thread(target=sessions.close, args=[session], daemon=True).start()
     assert looks.wait(HANG)
     session.released.set()
-    ends = threading.Thread(target=sessions._wait, daemon=True)
-    ends.start()
-    ends.join(0.1)
-    assert ends.is_alive()
-    go_on.set()
-    ends.join(HANG)
-    assert not ends.is_alive()
+    assert_the_end_waits_for(go_on, sessions)
 
 
 def test_the_end_of_a_process_waits_for_who_frees_a_session() -> None:
     freed = threading.Event()
     closer = threading.Thread(target=freed.wait, args=[HANG], name=links.CLOSER, daemon=True)
     closer.start()
-    ends = threading.Thread(target=links.Sessions()._wait, daemon=True)
-    ends.start()
-    ends.join(0.1)
-    assert ends.is_alive()
-    freed.set()
-    ends.join(HANG)
-    assert not ends.is_alive()
+    assert_the_end_waits_for(freed, links.Sessions())
 
 
 def test_a_caller_that_is_cancelled_while_it_leaves_has_the_session_closed() -> None:

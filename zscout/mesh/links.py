@@ -113,6 +113,7 @@ class Sessions:
             ready.set()
 
     def _wait(self) -> None:
+        """Wait for these threads, ZENOHS_CLOSE_S at most."""
         until = time.monotonic() + ZENOHS_CLOSE_S
         while self._at_work and (left := until - time.monotonic()) > 0:
             for ready in list(self._at_work)[:1]:
