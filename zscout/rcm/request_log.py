@@ -6,9 +6,10 @@ while. The history of each ARC is kept as text, for `zscout why` and the log."""
 from __future__ import annotations
 
 from collections import OrderedDict, deque
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any, Final
+from itertools import chain
+from typing import Any, Final, TypeAlias
 
 from msgspec.structs import replace
 
@@ -62,6 +63,10 @@ def upcoming_info(end: UpcomingEnd, now: Ns) -> messages.Upcoming:
     return messages.Upcoming(end.code, party_info(end.by, now), list(end.rcs), safe, begins_in)
 
 
+_Line: TypeAlias = tuple[Ns, ArcId, str, str]
+"""A line of the history: time, ARC, its name, text."""
+
+
 @dataclass(slots=True)
 class _Request:
     name: str
@@ -91,7 +96,7 @@ class RequestLog:
         self._report_at: Ns | None = None
         self._starts: Mapping[ArcId, Ns] = {}  # the last forecast
         self._forecast: tuple[int, Ns] | None = None  # the batch of events and the time at which it was made
-        self._lines: deque[tuple[Ns, ArcId, str, str]] = deque(maxlen=MAX_LINES)  # time, ARC, its name, text
+        self._lines: deque[_Line] = deque(maxlen=MAX_LINES)
         self.traced: list[tuple[str, ArcId]] = []
         """ARCs that are over for good, or were reopened, since the caller took this list."""
         self._upcoming: dict[ArcId, tuple[UpcomingEnd, ...]] = {}
@@ -283,8 +288,7 @@ class RequestLog:
     def present(self, now: Ns, arcs: Iterable[ArcId]) -> list[Notice]:
         """The notices with the present state of these ARCs, without those that are closed."""
         opened = [arc for arc in arcs if self._core.is_open(arc)]
-        for arc in opened:
-            self._changed.pop(arc, None)
+        self._record_reasons(now, opened)
         return [self.notice(now, arc) for arc in opened]
 
     @property
@@ -298,8 +302,6 @@ class RequestLog:
             self._changed |= {effect.arc: None for effect in self._core.report_reasons() if isinstance(effect, Queued)}
             undecided = [arc for arc in self._changed if self.may_be_held(now, arc)]
             changed = [arc for arc in self._changed if arc not in undecided and self._core.is_queued(arc)]
-            self._changed = dict.fromkeys(changed)
-            self._record_reasons(now)
             out.notices = [*self.present(now, changed), *self._upcoming_notices(now)]
             self._changed = dict.fromkeys(undecided)
             self._report_at = now + REASONS_DELAY if undecided else None
@@ -377,20 +379,27 @@ class RequestLog:
         """The latest lines about an ARC (its name, id, or `<host>/<client>/<id>`), oldest first."""
         lines = [
             StoryLine(ago=(now - at) / SECOND, text=text)
-            for at, full, name, text in self._lines
+            for at, full, name, text in chain(self._lines, self._reasons(now, self._changed))
             if arc in (name, full, request_id(full))
         ]
         return lines[-MAX_ANSWERED:]
 
     def close(self, now: Ns) -> str:
-        self._record_reasons(now)
+        self._record_reasons(now, list(self._changed))
         return self._log_text()
 
-    def _record_reasons(self, now: Ns) -> None:
-        changed, self._changed = self._changed, {}
-        for arc in filter(None, map(self._core.arc, changed)):
+    def _record_reasons(self, now: Ns, arcs: Iterable[ArcId]) -> None:
+        """Record the changed reasons of these ARCs, before they are notified."""
+        changed = [arc for arc in dict.fromkeys(arcs) if arc in self._changed]
+        for _, arc, _, text in self._reasons(now, changed):
+            self.record(now, arc, text)
+        for arc in changed:
+            del self._changed[arc]
+
+    def _reasons(self, now: Ns, arcs: Iterable[ArcId]) -> Iterator[_Line]:
+        for arc in filter(None, map(self._core.arc, arcs)):
             if arc.hold is None:
-                self.record(now, arc.id, waits(str(arc.reported), arc.reported))
+                yield now, arc.id, self.name(arc.id), waits(str(arc.reported), arc.reported)
 
     def _log_text(self) -> str:
         lines, self._unlogged, self._log_at = self._unlogged, [], None

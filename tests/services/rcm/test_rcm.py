@@ -48,6 +48,24 @@ async def test_a_grant_is_published_and_the_loser_told_while_its_answer_is_on_th
     ]
 
 
+async def test_a_reason_is_in_the_story_once_as_soon_as_an_answer_has_it() -> None:
+    fleet, _ = await fleet_of("robot/a")
+    survey, chat, desk = fleet.client("survey"), fleet.client("chat"), fleet.client("desk")
+    await survey.ask("survey", "robot/a")
+
+    async def story() -> list[str]:
+        return [line.text for line in (await fleet.state(arc="chat")).story]
+
+    asked = "asked for robot/a at priority 0"
+    waits = (await chat.ask("chat", "robot/a")).reason
+    assert await story() == [asked, waits]
+    await asyncio.sleep(1)
+    assert await story() == [asked, waits]
+    await chat.do(HandOver("chat", desk.name))
+    await asyncio.sleep(1)
+    assert await story() == [asked, waits, "handed over to desk/desk", waits]
+
+
 async def test_who_missed_how_its_hold_ended_is_told_when_it_asks_again() -> None:
     fleet, _ = await fleet_of("robot/a")
     survey, operator = fleet.client("survey"), fleet.client("operator")
