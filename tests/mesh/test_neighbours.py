@@ -21,7 +21,8 @@ from zscout.config.fleet import Fleet, MeshConfig, beside, default_fleet
 from zscout.keyexpr import Sender, new_instance
 from zscout.mesh import ZenohMesh, neighbours
 from zscout.mesh.neighbours import MAX_NEIGHBOURS, Meeting
-from zscout.mesh.zenoh_mesh import zenoh_config
+from zscout.mesh.zenoh_mesh import increasing_id, zenoh_config
+from zscout.types import SECOND
 
 pytestmark = [pytest.mark.real_time, pytest.mark.skipif(sys.platform != "linux", reason="abstract sockets are Linux's")]
 
@@ -101,6 +102,17 @@ def test_a_new_session_waits_until_a_neighbour_of_the_same_moment_listens(
         waiting.result()
         assert older.endpoint in newer.others[0]
     older.close()
+    newer.close()
+
+
+def test_a_neighbour_is_known_by_its_id_while_it_lives(fleet: Fleet) -> None:
+    older, newer = (Meeting(fleet.name, fleet.mesh, "tcp") for _ in range(2))
+    both = increasing_id(older.at), increasing_id(newer.at)
+    assert newer.is_neighbour(both[0])
+    assert older.is_neighbour(both[1])
+    assert not newer.is_neighbour(increasing_id(newer.at + SECOND))
+    older.close()
+    assert not newer.is_neighbour(both[0])
     newer.close()
 
 

@@ -18,6 +18,7 @@ from msgspec.structs import replace
 from tests.mesh.kit import WITHIN, until
 from zscout.config.fleet import MeshConfig
 from zscout.mesh import relinking
+from zscout.mesh.relinking import Relinking
 from zscout.mesh.zenoh_mesh import ZenohTransport, _relinking, increasing_id, zenoh_config
 
 _PORT = re.compile(r":(\d+)(?:[?#].*)?$")
@@ -237,3 +238,27 @@ async def test_a_relay_is_not_looked_for(stack: AsyncExitStack, monkeypatch: pyt
     await until(lambda: _ends(here, there) - before)
     assert looked
     assert address not in looked
+
+
+async def test_a_neighbour_s_link_is_left_to_zenoh(stack: AsyncExitStack, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Who is introduced to a neighbour is linked to it by a network address."""
+    here = await _World(stack).peer()
+    config = zenoh_config(MeshConfig(multicast=False))
+    relinks = Relinking(here._session, config, lambda _: config, lambda peer: peer != "c3")
+    stack.callback(relinks.close)
+    await until(lambda: relinks._thread is None)
+    wanted: list[str] = []
+    monkeypatch.setattr(relinking, "_listens", lambda _: True)
+    monkeypatch.setattr(relinks, "_begin", lambda **_: None)
+
+    def scout(_seconds: float, peers: set[str]) -> dict[str, list[str]]:
+        wanted.extend(peers)
+        return {}
+
+    monkeypatch.setattr(relinks, "_scout", scout)
+    for peer, ip in (("a1", "[fd00::2]"), ("b2", "127.0.0.1"), ("c3", "127.0.0.1")):
+        link = SimpleNamespace(zid=peer, src=f"tcp/{ip}:1", dst=f"tcp/{ip}:2")
+        relinks._on_link(cast("zenoh.LinkEvent", SimpleNamespace(kind=zenoh.SampleKind.DELETE, link=link)))
+    assert [peer for peer, lost in relinks._lost.items() if lost.together] == ["b2", "c3"]
+    relinks._try_all()
+    assert wanted == ["c3"]

@@ -7,6 +7,7 @@ middle, lets an attempt last 10 s, in which all links of the session stand, and 
 from __future__ import annotations
 
 import atexit
+import ipaddress
 import os
 import re
 import socket
@@ -14,7 +15,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from typing import Any, Final, Protocol, TypeAlias
+from typing import Any, Final, NamedTuple, Protocol, TypeAlias
 
 import psutil
 import zenoh
@@ -31,18 +32,31 @@ Address: TypeAlias = tuple[str, int]
 Ends: TypeAlias = tuple[Address, Address]
 """The address and port of this end, and of the other end."""
 NOWHERE: Final[Address] = ("", 0)
+SLOW: Final = "closes a session"
+"""Name of threads that Zenoh closes a session in."""
 CLOSER: Final = "closes the mesh"
 """Name of threads that close a session, and may be the last to refer to it."""
 
 
 class Link(Protocol):
-    """A link of a session, by the endpoints of both ends."""
+    """A link of a session, by the endpoints of both ends and the id of the other session."""
+
+    @property
+    def zid(self) -> object: ...
 
     @property
     def src(self) -> object: ...
 
     @property
     def dst(self) -> object: ...
+
+
+class Socket(NamedTuple):
+    fd: int
+    inode: int
+    """Unlike `fd`, no later socket has the same."""
+    ends: Ends
+    """The other end of a listener is NOWHERE."""
 
 
 class Sessions:
@@ -82,19 +96,24 @@ class Sessions:
             self._open = [other for other in self._open if other is not session]
         attempts = {address(endpoint) for endpoint in sought} - {NOWHERE}
         ports = {address(endpoint)[1] for endpoint in listening} - {0}
-        closing = threading.Thread(target=close, name="closes a session", daemon=True)
+        closing = threading.Thread(target=close, name=SLOW, daemon=True)
         closing.start()
         began = time.monotonic()
         closing.join(CLOSE_SOON_S)
+        # The next session may have the same ports and endpoints, as soon as these are shut.
+        standing = {found.inode for found in _sockets()} if closing.is_alive() else set()
         while closing.is_alive():  # others may link to it as long as it listens
             own = _links(session) if time.monotonic() - began >= LINKS_END_S else set()
             with self._lock:
                 kept = {link for other in self._open for link in _links(other)}
 
-            def goes(here: Address, there: Address, own: set[Ends] = own, kept: set[Ends] = kept) -> bool:
+            def goes(found: Socket, own: set[Ends] = own, kept: set[Ends] = kept) -> bool:
+                here, there = found.ends
+                if found.ends in own or found.inode not in standing:
+                    return found.ends in own
                 if there == NOWHERE:
                     return here[1] in ports
-                return (here, there) in own or (there in attempts and (here, there) not in kept)
+                return there in attempts and found.ends not in kept
 
             shut(goes)
             closing.join(CLOSE_SOON_S)
@@ -149,16 +168,30 @@ def is_local(link: Link) -> bool:
     return here == there != ""
 
 
-def shut(chosen: Callable[[Address, Address], bool]) -> None:
-    """Shut down the sockets of this process with chosen ends: Zenoh can't end a single link. A listener has no other
-    end, NOWHERE."""
-    with suppress(psutil.Error, OSError):  # sockets can't be listed here
-        for found in psutil.Process().net_connections("tcp"):
-            if chosen(_plain(found.laddr), _plain(found.raddr) if len(found.raddr) else NOWHERE):
-                # A copy: the descriptor may be closed meanwhile, and its number be given to another socket.
-                with suppress(OSError), socket.socket(fileno=os.dup(found.fd)) as copy:
-                    if _plain(copy.getsockname()) == _plain(found.laddr):
-                        copy.shutdown(socket.SHUT_RDWR)
+def by_network(link: Link) -> bool:
+    """Return True for a link within this host by a network address: it ends with that address."""
+    return is_local(link) and not ipaddress.ip_address(ends(link)[0][0]).is_loopback
+
+
+def shut(chosen: Callable[[Socket], bool]) -> None:
+    """Shut down chosen sockets of this process: Zenoh can't end a single link."""
+    for found in _sockets():
+        if chosen(found):
+            # A copy: the descriptor may be closed meanwhile, and its number be given to another socket.
+            with suppress(OSError), socket.socket(fileno=os.dup(found.fd)) as copy:
+                if os.fstat(copy.fileno()).st_ino == found.inode:
+                    copy.shutdown(socket.SHUT_RDWR)
+
+
+def _sockets() -> list[Socket]:
+    """The TCP sockets of this process; empty where they can't be listed."""
+    found = list[Socket]()
+    with suppress(psutil.Error, OSError):
+        for known in psutil.Process().net_connections("tcp"):
+            both = _plain(known.laddr), _plain(known.raddr) if len(known.raddr) else NOWHERE
+            with suppress(OSError):  # it was closed
+                found.append(Socket(known.fd, os.fstat(known.fd).st_ino, both))
+    return found
 
 
 def _plain(name: Sequence[Any]) -> Address:

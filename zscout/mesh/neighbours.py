@@ -9,7 +9,6 @@ it only gives an address."""
 from __future__ import annotations
 
 import hashlib
-import ipaddress
 import re
 import socket
 import time
@@ -19,7 +18,7 @@ from pathlib import Path
 from typing import Final
 
 from zscout.config.fleet import MeshConfig
-from zscout.mesh.links import Link, ends, is_local, shut
+from zscout.mesh.links import Link, by_network, ends, is_local, shut
 from zscout.types import SECOND
 
 MAX_NEIGHBOURS: Final = 64
@@ -54,8 +53,13 @@ class Meeting:
             self.endpoint = f"{protocol}/127.0.0.1:{port}"
             # Publish before listing: of two sessions that start together at least one finds the other.
             self._published.bind(f"\0zscout-mesh-{meeting}-{protocol}-{port}-{self.at}")
-            older = _older(meeting, protocol, self.at)
+            self._name = re.compile(
+                rf"@zscout-mesh-{meeting}-{protocol}-(\d{{1,5}})-(\d{{1,20}})$", re.ASCII | re.MULTILINE
+            )
+            # Of two sessions the newer one makes the link.
+            older = [(at, port) for at, port in self._neighbours() if at < self.at][:MAX_NEIGHBOURS]
             self.others = [f"{protocol}/127.0.0.1:{port}{_RETRY}" for _, port in older]
+            self._older = {time_in_id(at) for at, _ in older}
             self._young = {port for at, port in older if self.at - at < YOUNG}
         except OSError:
             self.close()
@@ -76,13 +80,26 @@ class Meeting:
         wanted = len(others) if self._young else 0
         for _ in range(round(RELINK_TIMEOUT_S / POLL_S)):
             found = [link for link in links() if is_local(link)]
-            outside = {both for both in map(ends, found) if not ipaddress.ip_address(both[0][0]).is_loopback}
+            outside = {ends(link) for link in found if by_network(link)}
             if outside and not others <= {str(link.dst) for link in found}:
                 wanted = max(wanted, len(found))
-                shut(lambda here, there, outside=outside: (here, there) in outside)  # type: ignore[misc]
+                shut(lambda found, outside=outside: found.ends in outside)  # type: ignore[misc]
             elif len(found) >= wanted:
                 return
             time.sleep(POLL_S)
+
+    def is_neighbour(self, peer: str) -> bool:
+        """Return True for the id of a session of this host if one of the two links to the published address of the
+        other, as long as both live."""
+        time = peer[-12:]
+        return any(time_in_id(at) == time and (at > self.at or time in self._older) for at, _ in self._neighbours())
+
+    def _neighbours(self) -> list[tuple[int, int]]:
+        """Times and ports of all sessions with names, its own too, the oldest first."""
+        found = list[tuple[int, int]]()
+        with suppress(OSError):
+            found = [(int(at), int(port)) for port, at in self._name.findall(_NAMES.read_text(errors="replace"))]
+        return sorted((at, port) for at, port in found if at < 1 << 64 and 0 < port < 65_536)
 
     def release_port(self) -> None:
         """Close the reserving socket: Zenoh listens on the port now."""
@@ -93,13 +110,9 @@ class Meeting:
         self._published.close()
 
 
-def _older(meeting: str, protocol: str, before: int) -> list[tuple[int, int]]:
-    """Times and ports of older neighbours, the oldest first: of two sessions the newer one makes the link."""
-    name = re.compile(rf"@zscout-mesh-{meeting}-{protocol}-(\d{{1,5}})-(\d{{1,20}})$", re.ASCII | re.MULTILINE)
-    found = list[tuple[int, int]]()
-    with suppress(OSError):
-        found = [(int(at), int(port)) for port, at in name.findall(_NAMES.read_text(errors="replace"))]
-    return sorted((at, port) for at, port in found if at < before and 0 < port < 65_536)[:MAX_NEIGHBOURS]
+def time_in_id(at: int) -> str:
+    """The end of the id of a session with this time, in ns since 1970, which orders ids by time (`increasing_id`)."""
+    return at.to_bytes(8, "little").hex()[4:]
 
 
 def _listening() -> set[int]:

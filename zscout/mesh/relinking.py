@@ -22,7 +22,8 @@ from typing import Any, Final
 import zenoh
 from zenoh.handlers import Callback
 
-from zscout.mesh.links import SESSIONS
+from zscout.mesh.interfaces import LOOPBACK
+from zscout.mesh.links import SESSIONS, by_network, ends, is_local
 
 log = logging.getLogger(__name__)
 
@@ -48,17 +49,24 @@ class _Lost:
     attempts: int = 0
     listens: bool | None = None  # once True not probed again: an unused connection blocks a TLS listener for 0.1 s
     together: bool = False  # True if this process looks for the peer though the peer makes the link
+    neighbour: bool = False  # Zenoh tries its loopback address again at once; gossip would link by a network address
 
 
 class Relinking:
     """Restores the links of one session, in a thread that runs while a link is lost.
 
-    `scouting`: settings for finding peers; `meeting`: for a temporary session with only the given addresses."""
+    `scouting`: settings for finding peers; `meeting`: for a temporary session with only the given addresses;
+    `is_neighbour`: True for ids of sessions that Zenoh links by loopback (neighbours.py)."""
 
     def __init__(
-        self, session: zenoh.Session, scouting: zenoh.Config, meeting: Callable[[Sequence[str]], zenoh.Config]
+        self,
+        session: zenoh.Session,
+        scouting: zenoh.Config,
+        meeting: Callable[[Sequence[str]], zenoh.Config],
+        is_neighbour: Callable[[str], bool] = lambda _: False,
     ) -> None:
         self._session, self._scouting, self._meeting = session, scouting, meeting
+        self._is_neighbour = is_neighbour
         self._own = str(session.zid())
         self._lock = threading.Lock()
         self._lost: dict[str, _Lost] = {}
@@ -94,13 +102,19 @@ class Relinking:
 
     def _on_link(self, event: zenoh.LinkEvent) -> None:
         now, peer = time.monotonic(), str(event.link.zid)
+        if event.kind == zenoh.SampleKind.PUT or peer.startswith(TEMPORARY_ID):
+            return  # `_try_all` sees new links: they may vanish without another event
+        neighbour = is_local(event.link) and self._is_neighbour(peer)
+        if neighbour and by_network(event.link):
+            return  # the newer one of the two ended it, and links by loopback
+        neighbour = neighbour and ends(event.link)[0][0] == LOOPBACK
         with self._lock:
-            if event.kind == zenoh.SampleKind.PUT or self._closed.is_set() or peer.startswith(TEMPORARY_ID):
-                return  # `_try_all` sees new links: they may vanish without another event
+            if self._closed.is_set():
+                return
             if peer in self._routers:
                 self._routers.remove(peer)
                 return
-            self._lost.setdefault(peer, _Lost(now)).addresses.append(event.link.dst)
+            self._lost.setdefault(peer, _Lost(now, neighbour=neighbour)).addresses.append(event.link.dst)
             recent = [lost for lost in self._lost.values() if now - lost.at < SIMULTANEOUS]
             for lost in recent:
                 if len(recent) > 1 and not lost.together:
@@ -120,7 +134,7 @@ class Relinking:
             log.debug("looking for peers failed: %s", error)
             return
         with self._lock:
-            for peer in found.keys() - {self._own}:
+            for peer in (peer for peer in found.keys() - {self._own} if not self._is_neighbour(peer)):
                 self._lost.setdefault(peer, _Lost(time.monotonic(), together=True))
 
     def _run(self, greet: bool) -> None:
@@ -161,8 +175,8 @@ class Relinking:
             if time.monotonic() > until or self._closed.is_set():
                 break
             link.attempts += 1
-            link.listens = link.listens or _listens(link.addresses)
-            if link.listens or (link.together and link.attempts <= GREATER_ID_ATTEMPTS):
+            link.listens = not link.neighbour and (link.listens or _listens(link.addresses))
+            if link.listens or (link.together and not link.neighbour and link.attempts <= GREATER_ID_ATTEMPTS):
                 wanted.add(peer)
             elif link.listens is False and time.monotonic() - link.at >= SIMULTANEOUS:
                 # The peer's process ended, or the peer makes the link. Until SIMULTANEOUS is over,

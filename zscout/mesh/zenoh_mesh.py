@@ -34,7 +34,7 @@ from zscout.logs import shortage
 from zscout.mesh import interfaces
 from zscout.mesh.exchange import SPAWN, MeshError
 from zscout.mesh.links import CLOSER, SESSIONS
-from zscout.mesh.neighbours import Meeting
+from zscout.mesh.neighbours import Meeting, time_in_id
 from zscout.mesh.relinking import TEMPORARY_ID, Relinking
 from zscout.mesh.renewal import RenewableTransport
 from zscout.mesh.session import Mesh
@@ -285,7 +285,7 @@ def increasing_id(at: int | None = None) -> str:
     """A session id greater than all earlier ones, so that the newer session makes the links. `at`: its time, in ns
     since 1970; None: now. Zenoh compares ids from the last byte on, and prints them as a number."""
     time_ns = time.time_ns() if at is None else at
-    return f"1{secrets.token_hex(9)}0{time_ns.to_bytes(8, 'little').hex()[4:]}"
+    return f"1{secrets.token_hex(9)}0{time_in_id(time_ns)}"
 
 
 def check_room(files: int = SESSION_FILES, threads: int = SESSION_THREADS) -> None:
@@ -364,21 +364,24 @@ async def _open(fleet: str, config: MeshConfig, security: Security | None) -> Tr
     try:
         # A relay leaves relinking to its sites, which have its address.
         relinks = config.multicast and not config.relay
-        relinking = _relinking(session, config, security) if relinks else None
+        relinking = _relinking(session, config, security, met) if relinks else None
         return ZenohTransport(session, relinking, met, config)
     except BaseException:
         in_thread(CLOSER, functools.partial(SESSIONS.close, session))
         raise
 
 
-def _relinking(session: zenoh.Session, config: MeshConfig, security: Security | None = None) -> Relinking:
+def _relinking(
+    session: zenoh.Session, config: MeshConfig, security: Security | None = None, met: Meeting | None = None
+) -> Relinking:
     def meeting(addresses: Sequence[str]) -> zenoh.Config:
         settings = zenoh_config(replace(config, multicast=False, connect=tuple(addresses)), security)
         settings.insert_json5("listen/endpoints", "[]")
         settings.insert_json5("scouting/gossip/autoconnect", '{"peer": []}')
         return settings
 
-    return Relinking(session, zenoh_config(config, security), meeting)
+    is_neighbour: Callable[[str], bool] = (lambda _: False) if met is None else met.is_neighbour
+    return Relinking(session, zenoh_config(config, security), meeting, is_neighbour)
 
 
 _opened_in: int | None = None
