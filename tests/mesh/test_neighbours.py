@@ -20,6 +20,7 @@ from tests.mesh.kit import until
 from zscout.config.fleet import Fleet, MeshConfig, beside, default_fleet
 from zscout.keyexpr import Sender, new_instance
 from zscout.mesh import ZenohMesh, neighbours
+from zscout.mesh.links import Socket, ends
 from zscout.mesh.neighbours import MAX_NEIGHBOURS, Meeting
 from zscout.mesh.zenoh_mesh import increasing_id, zenoh_config
 from zscout.types import SECOND
@@ -102,6 +103,38 @@ def test_a_new_session_waits_until_a_neighbour_of_the_same_moment_listens(
         waiting.result()
         assert older.endpoint in newer.others[0]
     older.close()
+    newer.close()
+
+
+def link(here: str, there: str, peer: str) -> SimpleNamespace:
+    return SimpleNamespace(src=f"tcp/{here}:1", dst=f"tcp/{there}:2", zid=peer)
+
+
+def test_a_new_session_ends_its_links_to_neighbours_by_a_network_until_they_have_one_by_loopback(
+    fleet: Fleet, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    older, newer = (Meeting(fleet.name, fleet.mesh, "tcp") for _ in range(2))
+    peer = increasing_id(older.at)
+    temporary = link("192.0.2.2", "192.0.2.2", increasing_id(newer.at + SECOND))
+    other_host = link("192.0.2.2", "192.0.2.3", increasing_id())
+    wrong, right = link("192.0.2.2", "192.0.2.2", peer), link("::1", "::1", peer)
+    looks = iter([[temporary], [temporary, other_host, wrong], [temporary, other_host], [temporary, other_host, right]])
+    chosen: list[list[bool]] = []
+    monkeypatch.setattr(neighbours, "RELINK_TIMEOUT_S", HANG)
+    sockets = [Socket(number, number, ends(known)) for number, known in enumerate((right, other_host, wrong))]
+    monkeypatch.setattr(neighbours, "shut", lambda goes: chosen.append([goes(known) for known in sockets]))
+    newer.relink(lambda: next(looks))
+    assert chosen == [[False, False, True]]
+    assert not list(looks)
+    older.close()
+    newer.close()
+
+
+def test_a_neighbour_that_ended_is_not_waited_for(fleet: Fleet, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(neighbours, "RELINK_TIMEOUT_S", HANG)
+    older, newer = (Meeting(fleet.name, fleet.mesh, "tcp") for _ in range(2))
+    older.close()
+    newer.relink(list)
     newer.close()
 
 

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Final
 
 from zscout.config.fleet import MeshConfig
-from zscout.mesh.links import Link, by_network, ends, is_local, shut
+from zscout.mesh.links import Link, by_network, ends, shut
 from zscout.types import SECOND
 
 MAX_NEIGHBOURS: Final = 64
@@ -60,7 +60,7 @@ class Meeting:
             older = [(at, port) for at, port in self._neighbours() if at < self.at][:MAX_NEIGHBOURS]
             self.others = [f"{protocol}/127.0.0.1:{port}{_RETRY}" for _, port in older]
             self._older = {time_in_id(at) for at, _ in older}
-            self._young = {port for at, port in older if self.at - at < YOUNG}
+            self._young = {time_in_id(at): port for at, port in older if self.at - at < YOUNG}
         except OSError:
             self.close()
             raise
@@ -68,31 +68,32 @@ class Meeting:
     def wait_for_others(self) -> None:
         """Wait until the neighbours listen that were opened at about the same time. Blocks LISTEN_TIMEOUT_S at most."""
         tries = round(LISTEN_TIMEOUT_S / POLL_S) if self._young else 0
-        while tries and not self._young <= _listening():
+        while tries and not set(self._young.values()) <= _listening():
             tries -= 1
             time.sleep(POLL_S)
 
     def relink(self, links: Callable[[], Iterable[Link]]) -> None:
-        """End the links of a new session by network addresses of this host, if neighbours have no link by loopback:
-        Zenoh tries these again soon, and has nothing to lose yet. Blocks RELINK_TIMEOUT_S at most."""
-        others = {endpoint.partition("#")[0] for endpoint in self.others}
-        # Those of the same moment may not be linked yet.
-        wanted = len(others) if self._young else 0
+        """End the links of a new session to older neighbours by network addresses: Zenoh soon tries loopback again, and
+        has nothing to lose yet. Blocks RELINK_TIMEOUT_S at most, while such a link stands or a neighbour of the same
+        moment is not linked yet."""
+        waiting = set(self._young)
         for _ in range(round(RELINK_TIMEOUT_S / POLL_S)):
-            found = [link for link in links() if is_local(link)]
-            outside = {ends(link) for link in found if by_network(link)}
-            if outside and not others <= {str(link.dst) for link in found}:
-                wanted = max(wanted, len(found))
-                shut(lambda found, outside=outside: found.ends in outside)  # type: ignore[misc]
-            elif len(found) >= wanted:
+            found = {ends(link): (_time_of(link.zid), by_network(link)) for link in links()}
+            wrong = {both: peer for both, (peer, bad) in found.items() if bad and peer in self._older}
+            waiting = waiting.union(wrong.values()) - {peer for peer, bad in found.values() if not bad}
+            if wrong:
+                shut(lambda found, wrong=wrong: found.ends in wrong)  # type: ignore[misc]
+            elif not waiting:
                 return
             time.sleep(POLL_S)
+            # Those that ended get no link.
+            waiting = waiting and waiting & {time_in_id(at) for at, _ in self._neighbours()}
 
     def is_neighbour(self, peer: str) -> bool:
         """Return True for the id of a session of this host if one of the two links to the published address of the
         other, as long as both live."""
-        time = peer[-12:]
-        return any(time_in_id(at) == time and (at > self.at or time in self._older) for at, _ in self._neighbours())
+        began = _time_of(peer)
+        return any(time_in_id(at) == began and (at > self.at or began in self._older) for at, _ in self._neighbours())
 
     def _neighbours(self) -> list[tuple[int, int]]:
         """Times and ports of all sessions with names, its own too, the oldest first."""
@@ -113,6 +114,10 @@ class Meeting:
 def time_in_id(at: int) -> str:
     """The end of the id of a session with this time, in ns since 1970, which orders ids by time (`increasing_id`)."""
     return at.to_bytes(8, "little").hex()[4:]
+
+
+def _time_of(peer: object) -> str:
+    return str(peer)[-12:]
 
 
 def _listening() -> set[int]:
