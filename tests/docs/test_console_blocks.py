@@ -38,6 +38,8 @@ class Block(NamedTuple):
     """At a terminal, as its tables are narrow there."""
     alone: bool = False
     """In a fleet without nodes."""
+    settled: bool = False
+    """Once the leader refuses unknown devices: a new one waits for them."""
     bash: bool = False
     """In one shell, in the fleet's folder: for variables and for other programs."""
 
@@ -87,7 +89,7 @@ BLOCKS: Final = [
     Block("docs/how-to/use-in-ci.md", "zscout book"),
     Block("docs/how-to/use-in-ci.md", "./nightly.sh"),
     Block("docs/how-to/see-who-held-what.md", "history --since 7d"),
-    Block("docs/troubleshooting.md", "robot/arn1"),
+    Block("docs/troubleshooting.md", "robot/arn1", settled=True),
     Block("docs/troubleshooting.md", "zscout why survey", (ARM,)),
     Block("docs/troubleshooting.md", "echo $?", alone=True, bash=True),
     Block("docs/simulation.md", "zscout simulate --list"),
@@ -118,6 +120,8 @@ DEVICES: Final = (
 )
 NEW_DEVICE: Final = '[[rc]]\nname = "robot/arm2"\ndriver = "exclusive"\n'
 """Added to the node file where a page reloads it."""
+UNKNOWN: Final = 2
+"""Exit code where a device is unknown."""
 NO_LEADER: Final = "no leader is on the mesh"
 ALONE: Final = "alone.toml"
 """File of a fleet of the same name, in which nothing is found."""
@@ -271,6 +275,8 @@ def played(fleet: CliFleet, block: Block) -> Iterator[tuple[str, str, str]]:
     """Each command of a block, what its page shows, and what it printed."""
     for request, until in zip(block.requests, ("holds", "waits for"), strict=False):
         begin(fleet, request, until)
+    if block.settled:
+        fleet.until(lambda done: done.returncode == UNKNOWN, "request", "robot/none", "--dry-run", "--", "true")
     runner = Runner(fleet, block)
     try:
         for command, shown in sessions(block.page, block.words):

@@ -20,15 +20,15 @@ MAX_NAMED = 8
 
 
 class DeviceCheck:
-    """Before `settles` an unseen RC may still show up."""
+    """Before `settles_at` an unseen RC may still show up."""
 
-    def __init__(self, devices: ExpectedDevices, roster: Roster, settles: Ns) -> None:
-        self._devices, self._roster, self._settles = devices, roster, settles
+    def __init__(self, devices: ExpectedDevices, roster: Roster, settles_at: Ns) -> None:
+        self._devices, self._roster, self.settles_at = devices, roster, settles_at
 
     def check(self, now: Ns, needs: Mapping[Need, Amounts], *, waits: bool = False, may_wait: bool = True) -> None:
         """Raises Refused for parameters that no matching RC accepts; and, unless the request `waits`, for unknown
         devices and for more RCs than match a pattern. `may_wait`: the remedy is to wait."""
-        waits, expected, is_there = waits or now < self._settles, self._devices.names, self._roster.is_known
+        waits, expected, is_there = waits or now < self.settles_at, self._devices.names, self._roster.is_known
         wanted = Counter(need.partition("#")[0] for need in needs if is_pattern(need))
         for need, params in needs.items():
             if not params and (is_there(need) or need in expected):

@@ -89,6 +89,8 @@ class Operations:
         """By ARC: operations without an answer yet."""
         self._deferred: list[OperationAsked] = []
         """Operations of clients that believe in holds which RCs may yet report."""
+        self._unchecked: set[ArcId] = set()
+        """Requests for devices that may have been unseen only because this leader was new."""
         self._hand_overs: dict[int, tuple[Ticket, HandOver, ClientId, ClientId]] = {}
         """By number: hand-overs whose new client is looked for."""
         self._hand_over_count = 0
@@ -239,6 +241,11 @@ class Operations:
     def _ask_again(self, ticket: Ticket, ask: Ask, sender: Sender, client: ClientId, arc: ArcId) -> None:
         """Answer for an open ARC with its state, after the instant if its client reports something new."""
         instant = self.instant
+        if arc in self._unchecked and self._now >= self._device_check.settles_at:
+            self._unchecked.remove(arc)
+            if self.core.is_queued(arc):
+                # Its client withdraws a request that is refused.
+                self._device_check.check(self._now, ask.needs)
         self._registry.enter(arc, ask.arc, estimate=ask.estimate)
         place, known, shown = self._owned_place(ask, client), self.core.arc(arc), list[model.Event]()
         if known is not None and not known.vouched:
@@ -266,6 +273,8 @@ class Operations:
             since = self._now - round(ask.waited * SECOND)
         elif ask.check and ask.place is None and ask.grant is None:
             self._device_check.check(self._now, ask.needs, waits=ask.wait_for_device)
+            if self._now < self._device_check.settles_at and not ask.wait_for_device:
+                self._unchecked.add(arc)
         self._registry.enter(arc, ask.arc, estimate=ask.estimate)
         instant.touched.add(arc)
         instant.asked.append(model.Requested(request, place, since))

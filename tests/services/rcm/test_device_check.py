@@ -119,7 +119,10 @@ async def test_the_leader_refuses_what_it_knows_only_to_who_asks_for_that() -> N
     assert (await client.ask("foreign", "radio/rf0:50")).state == "running"
     # So soon it may not know all devices yet.
     assert (await client.ask("early", "robot/arn1", check=True)).state == "queued"
+    assert (await client.ask("early", "robot/arn1")).state == "queued"
     await asyncio.sleep(fleet.fleet.timing.hold_lease / SECOND)
+    with pytest.raises(Refusal, match="unknown_device: unknown device robot/arn1; did you mean robot/arm1"):
+        await client.ask("early", "robot/arn1")
     with pytest.raises(Refusal, match="unknown_device: unknown device robot/arn2; did you mean robot/arm1"):
         await client.ask("typo", "robot/arn2", check=True)
     assert (await client.ask("patient", "robot/arn2", check=True, wait_for_device=True)).state == "queued"
