@@ -204,7 +204,7 @@ class Runner:
                 self._shell.type(f"export ZSCOUT_FLEET={ALONE}")
 
     def run(self, command: str, output: str) -> str:
-        """What a command prints, to its end; one that waits on its page is ended when it says so."""
+        """Return what a command prints. End it as soon as it prints that it waits, if it waits on its page."""
         command = re.sub(r"\bsleep \d+", "sleep 0", command).replace(" ./", f" {self._fleet.folder}/")
         command = re.sub(r"(simulate .*)--mesh", r"\1--mesh --for 1", command)
         # The pages' dates will pass.
@@ -272,7 +272,7 @@ def begin(fleet: CliFleet, request: str, until: str) -> None:
 
 
 def played(fleet: CliFleet, block: Block) -> Iterator[tuple[str, str, str]]:
-    """Each command of a block, what its page shows, and what it printed."""
+    """Yield each command of a block, with the output on its page and its real output."""
     for request, until in zip(block.requests, ("holds", "waits for"), strict=False):
         begin(fleet, request, until)
     if block.settled:

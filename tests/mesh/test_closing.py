@@ -236,5 +236,5 @@ async def test_a_session_that_closes_slowly_frees_its_port_for_the_next(
         assert mesh._transport.id() != before
         assert not mesh._transport.behind
         # The close that still goes on ends no listener but its own.
-        await until(lambda: links.SLOW not in (thread.name for thread in threading.enumerate()))
+        await until(lambda: links.CLOSING not in (thread.name for thread in threading.enumerate()))
         socket.create_connection(("127.0.0.1", port), HANG).close()

@@ -32,8 +32,8 @@ Address: TypeAlias = tuple[str, int]
 Ends: TypeAlias = tuple[Address, Address]
 """The address and port of this end, and of the other end."""
 NOWHERE: Final[Address] = ("", 0)
-SLOW: Final = "closes a session"
-"""Name of threads that Zenoh closes a session in."""
+CLOSING: Final = "closes a session"
+"""Name of the threads in which Zenoh closes a session."""
 CLOSER: Final = "closes the mesh"
 """Name of threads that close a session, and may be the last to refer to it."""
 
@@ -96,7 +96,7 @@ class Sessions:
             self._open = [other for other in self._open if other is not session]
         attempts = {address(endpoint) for endpoint in sought} - {NOWHERE}
         ports = {address(endpoint)[1] for endpoint in listening} - {0}
-        closing = threading.Thread(target=close, name=SLOW, daemon=True)
+        closing = threading.Thread(target=close, name=CLOSING, daemon=True)
         closing.start()
         began = time.monotonic()
         closing.join(CLOSE_SOON_S)
@@ -109,8 +109,10 @@ class Sessions:
 
             def goes(found: Socket, own: set[Ends] = own, kept: set[Ends] = kept) -> bool:
                 here, there = found.ends
-                if found.ends in own or found.inode not in standing:
-                    return found.ends in own
+                if found.ends in own:
+                    return True
+                if found.inode not in standing:
+                    return False
                 if there == NOWHERE:
                     return here[1] in ports
                 return there in attempts and found.ends not in kept

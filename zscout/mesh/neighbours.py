@@ -82,7 +82,7 @@ class Meeting:
             wrong = {both: peer for both, (peer, bad) in found.items() if bad and peer in self._older}
             waiting = waiting.union(wrong.values()) - {peer for peer, bad in found.values() if not bad}
             if wrong:
-                shut(lambda found, wrong=wrong: found.ends in wrong)  # type: ignore[misc]
+                shut(lambda known, wrong=wrong: known.ends in wrong)  # type: ignore[misc]
             elif not waiting:
                 return
             time.sleep(POLL_S)

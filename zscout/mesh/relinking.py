@@ -133,8 +133,10 @@ class Relinking:
         except zenoh.ZError as error:  # no interface is up, loopback included
             log.debug("looking for peers failed: %s", error)
             return
+        # Each look for neighbours reads a file: not under the lock, for which Zenoh's callbacks wait.
+        others = [peer for peer in found.keys() - {self._own} if not self._is_neighbour(peer)]
         with self._lock:
-            for peer in (peer for peer in found.keys() - {self._own} if not self._is_neighbour(peer)):
+            for peer in others:
                 self._lost.setdefault(peer, _Lost(time.monotonic(), together=True))
 
     def _run(self, greet: bool) -> None:
