@@ -66,7 +66,12 @@ async def recorded(folder: Path, ask: Callable[[Path], bool]) -> None:
             return ask(the_file(folder))
         return False
 
-    await until(is_so)
+    try:
+        await until(is_so)
+    except TimeoutError:
+        files = sorted(folder.iterdir())
+        shown = [(lanes(path, "/**"), events(path), presence(path)) for path in files if path.suffix == ".rrd"]
+        pytest.fail(f"never so: {files} {shown}")
 
 
 async def ended(lab: Lab, host: str) -> None:
@@ -246,6 +251,8 @@ async def test_what_ends_while_no_rcm_is_there_is_seen_from_the_devices(tmp_path
                 over.set()
 
         subscription = client.mesh.subscribe(client.mesh.keys.rc_state("robot/b"), RcState, heard)
+        # Client and device have a grant before its publication has left the leader for everybody else.
+        await recorded(runs, lambda path: lane(path, "/devices/robot/b") == [[""], ["survey"]])
         lab.nodes["a"].kill()
         async with asyncio.timeout(HANG):
             await over.wait()

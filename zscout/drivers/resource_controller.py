@@ -126,6 +126,8 @@ class ResourceController:
         """The newest term promised to a query to this instance."""
         self._last_published: Ns | None = None
         """When the last publication of the obeyed RCM arrived. Its answers do not count."""
+        self._published_since = False
+        """True if it has published since the last token of an RCM appeared or disappeared: one that died has not."""
         self._is_open = False
         """True while its driver is open."""
         self._served: list[Declaration] = []
@@ -300,6 +302,7 @@ class ResourceController:
 
     def _on_leader(self, token: Token, alive: bool) -> None:
         (self._leaders.add if alive else self._leaders.discard)(token)
+        self._published_since = False
         if not alive and self._asked.rcm == token.instance:
             # A leader from which this RC was cut off asks it again.
             self._asked = NO_TERM
@@ -310,6 +313,7 @@ class ResourceController:
         change = None if self.holds.follow(grants, now) else self._apply_grants(grants, now)
         if grants.term == self.holds.term:
             self._last_published = now
+            self._published_since = True
         if change or before != (self.holds.term, self.holds.seq):
             self._trace("hear")
         if change is not None:
@@ -792,9 +796,10 @@ class ResourceController:
         self.mesh.suspicions.suspect(
             f"{self.name}: an RCM is seen that does not publish", so=silent, patience=SILENT_RCM_PATIENCE
         )
+        publishes = self._receives and self._published_since
         signs = {
-            f"{self.name}: the RCM publishes and is not seen": self._receives and not self._leaders,
-            f"{self.name}: the RCM publishes and has not asked for its promise": self._receives
+            f"{self.name}: the RCM publishes and is not seen": publishes and not self._leaders,
+            f"{self.name}: the RCM publishes and has not asked for its promise": publishes
             and self.instances.state is not InstanceState.STANDS_BY
             and self._asked != self.holds.term,
         }

@@ -40,7 +40,7 @@ class SmallFleet:
         self.stall = StallWatch(self.devices.now).start()
         self.rcs = [
             ResourceController(
-                self.devices, name, ExclusiveDriver(), hold_lease=FLEET.timing.hold_lease / SECOND, stall=self.stall
+                self.devices, name, ExclusiveDriver(), hold_lease=fleet.timing.hold_lease / SECOND, stall=self.stall
             )
             for name in (RC, OTHER)
         ]

@@ -8,6 +8,7 @@ from contextlib import suppress
 from typing import Any
 
 import pytest
+from msgspec.structs import replace
 
 from tests.behaviors.client.small_fleet import ECHO, FLEET, RC, held, small_fleet, transport_of
 from tests.mesh.kit import until
@@ -93,6 +94,22 @@ async def test_a_client_that_hears_no_publication_of_an_rcm_that_it_sees_joins_t
             fleet.network.disturb({})
     said = {record.message.partition(": reopening the mesh session")[0] for record in caplog.records}
     assert "an RCM is seen that does not publish" in said
+
+
+@pytest.mark.parametrize("lease", [3, 12, 60])
+async def test_nobody_joins_the_mesh_anew_because_a_leader_died(lease: int, caplog: pytest.LogCaptureFixture) -> None:
+    """With a long hold lease its last publication counts for long; but there is none without its token."""
+    timing = replace(FLEET.timing, hold_lease=lease * SECOND)
+    with caplog.at_level(logging.WARNING, "zscout.mesh"):
+        async with small_fleet("one", "two", config=replace(FLEET, timing=timing)) as (fleet, (one, two)):
+            await held(one, "first")
+            waits = await two.request("second", {RC: {}}, min_runtime=60)
+            await fleet.lose_leader()
+            # Its questions are not answered, while it has had a publication of late.
+            for _ in range(2 * lease + 10):
+                await two.internals.rcm.ask(waits)
+                await asyncio.sleep(1)
+    assert [record.message for record in caplog.records] == []
 
 
 @pytest.mark.parametrize("whose", ["client", "RC"])

@@ -159,6 +159,23 @@ async def test_a_device_is_shown_as_there_as_soon_as_the_leader_says_so(path: Pa
     assert shown[-1] == ""
 
 
+async def test_a_device_that_a_new_leader_does_not_list_yet_is_shown_as_free(path: Path) -> None:
+    """A leader that begins may answer before its devices have; that it takes them in is not published."""
+    network = MemoryNetwork()
+    rcm = Leader(network)
+    node = network.open("lab", Sender("cart", "node"))
+    token = node.alive(Token("cart", Role.RC, SCOUT33, "i3"))
+    async with recording(path, ears(network), rcm.mesh):
+        await asyncio.sleep(1)
+        holder = Holder("a1", "hide", "cart/net", GRANT, PLACE, [SCOUT33], Decimal(5), 5)
+        rcm.mesh.put(rcm.mesh.keys.grants, grants(1, holder))
+        await asyncio.sleep(1)
+        rcm.mesh.put(rcm.mesh.keys.grants, grants(2))
+        await asyncio.sleep(1)
+    token.close()
+    assert [state for _, state in lanes(path, f"/devices/{SCOUT33}")[f"/devices/{SCOUT33}"]] == [[""], ["hide"], [""]]
+
+
 async def test_a_device_that_two_hosts_offer_is_there_without_one_of_them_and_its_hold_goes_on(path: Path) -> None:
     network = MemoryNetwork()
     view = HoldView("a1", "hide", "cart/net", 1, GRANT, PLACE, {SCOUT33: {}}, Decimal(5), 0.0, 5.0)

@@ -162,6 +162,11 @@ class RcmLink:
     def who(self) -> str:
         return "the leader" if self.leader is None else f"the leader at {self.leader}"
 
+    @property
+    def _publishes_unseen(self) -> bool:
+        """True if an RCM has published since the last token of one disappeared."""
+        return self.leader is None and self._last_contact > self._unseen_since
+
     async def leader_within(self, seconds: float) -> bool:
         """Wait for a leader to appear after `leader_came` was cleared; return False if none has within `seconds`."""
         return await done_within(seconds, self.leader_came.wait())
@@ -233,8 +238,9 @@ class RcmLink:
     async def _look_for_contradictions(self, *, silent: bool) -> None:
         """Suspect the mesh session if the leader's token, publications and answers contradict each other, or if
         candidates are visible and none leads for long."""
-        heard = self._contact_is_fresh
-        there, suspect = self.leader is not None or heard, self.mesh.suspicions.suspect
+        heard, suspect = self._contact_is_fresh, self.mesh.suspicions.suspect
+        # A leader that has died published of late, too.
+        there = self.leader is not None or (heard and self._publishes_unseen)
         suspect("an RCM is seen that does not answer", so=silent and there)
         suspect("an RCM answers that does not publish", so=not silent and not heard)
         candidates = self.mesh.keys.alive_any(Role.CANDIDATE)
@@ -297,8 +303,7 @@ class RcmLink:
                 await self.leader_within(min(step, pause))
                 pause -= step
                 # A leader that publishes and is not visible may have ended a hold without notifying this client.
-                publishes_unseen = self.leader is None and self._last_contact > self._unseen_since
-                if publishes_unseen or (unanswered and self.leader is not None):
+                if self._publishes_unseen or (unanswered and self.leader is not None):
                     break
             unanswered, known = False, self._changes
             for arc in self.store.open:

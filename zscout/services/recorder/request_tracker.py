@@ -104,8 +104,9 @@ class RequestTracker:
         if (state.term, state.seq) < (self.term, self.seq):
             return False
         self.term, self.seq = state.term, state.seq
+        # A new leader may not list yet what is offered; that it takes it in is not published.
         holders: dict[str, list[HoldView]] = {
-            rc: [] for rc in (*(view.rc for view in state.rcs if view.present), *self._rcs)
+            rc: [] for rc in (*(view.rc for view in state.rcs if view.present), *self._rcs, *self.offered)
         }
         open_now = {(hold.client, hold.id) for hold in state.holds}
         open_now |= {(wait.client, wait.id) for wait in state.queue}
