@@ -69,9 +69,12 @@ async def recorded(folder: Path, ask: Callable[[Path], bool]) -> None:
     try:
         await until(is_so)
     except TimeoutError:
-        files = sorted(folder.iterdir())
-        shown = [(lanes(path, "/**"), events(path), presence(path)) for path in files if path.suffix == ".rrd"]
-        pytest.fail(f"never so: {files} {shown}")
+        pytest.fail(f"never so: {said(folder)}")
+
+
+def said(folder: Path) -> list[tuple[Path, object]]:
+    """All that the files of a folder say."""
+    return [(path, (lanes(path, "/**"), events(path), presence(path))) for path in sorted(folder.iterdir())]
 
 
 async def ended(lab: Lab, host: str) -> None:
