@@ -46,7 +46,7 @@ lost that had promised another candidate. At 302655 links returned without the l
 whether its hold had ended; at 313763 the check knew no clock as it had been before it was set."""
 MISSED = {
     "order": 1, "grant": 8, "safe first": 1, "snapshots": 15, "step down": 4, "reopen": 8, "places": 5,
-    "withdrawn": 55, "believed": 70, "settling": 8, "deadline": 8, "once": 10, "sealed": 10, "copied": 3,
+    "withdrawn": 55, "believed": 68, "settling": 8, "deadline": 8, "once": 10, "sealed": 10, "copied": 3,
     "dates": 13, "merged": 3, "caught up": 4, "one stands": 33, "awaited": 3003, "had again": 33, "dates first": 113,
     "fleet time": 4, "late": 173, "steady": 3, "most clocks": 13, "door": 5, "clamped": 85, "certified": 5,
     "managers": 5, "begun": 35, "begun heard": 35, "words": 6, "doubted": 46, "sealed terms": 56, "back": 76,
