@@ -126,8 +126,8 @@ class ResourceController:
         """The newest term promised to a query to this instance."""
         self._last_published: Ns | None = None
         """When the last publication of the obeyed RCM arrived. Its answers do not count."""
-        self._published_since = False
-        """True if it has published since the last token of an RCM appeared or disappeared: one that died has not."""
+        self._published_since_token = False
+        """True if it has published since a token of an RCM last appeared or disappeared: an RCM that died has not."""
         self._is_open = False
         """True while its driver is open."""
         self._served: list[Declaration] = []
@@ -302,7 +302,7 @@ class ResourceController:
 
     def _on_leader(self, token: Token, alive: bool) -> None:
         (self._leaders.add if alive else self._leaders.discard)(token)
-        self._published_since = False
+        self._published_since_token = False
         if not alive and self._asked.rcm == token.instance:
             # A leader from which this RC was cut off asks it again.
             self._asked = NO_TERM
@@ -313,7 +313,7 @@ class ResourceController:
         change = None if self.holds.follow(grants, now) else self._apply_grants(grants, now)
         if grants.term == self.holds.term:
             self._last_published = now
-            self._published_since = True
+            self._published_since_token = True
         if change or before != (self.holds.term, self.holds.seq):
             self._trace("hear")
         if change is not None:
@@ -796,7 +796,7 @@ class ResourceController:
         self.mesh.suspicions.suspect(
             f"{self.name}: an RCM is seen that does not publish", so=silent, patience=SILENT_RCM_PATIENCE
         )
-        publishes = self._receives and self._published_since
+        publishes = self._receives and self._published_since_token
         signs = {
             f"{self.name}: the RCM publishes and is not seen": publishes and not self._leaders,
             f"{self.name}: the RCM publishes and has not asked for its promise": publishes

@@ -159,10 +159,13 @@ async def test_a_device_is_shown_as_there_as_soon_as_the_leader_says_so(path: Pa
     assert shown[-1] == ""
 
 
-async def test_a_device_that_a_new_leader_does_not_list_yet_is_shown_as_free(path: Path) -> None:
-    """A leader that begins may answer before its devices have; that it takes them in is not published."""
+@pytest.mark.parametrize(("listed", "shown"), [([], ""), ([RcView(SCOUT33, False, False)], "not there")])
+async def test_a_device_that_a_new_leader_does_not_know_yet_has_a_lane(
+    listed: list[RcView], shown: str, path: Path
+) -> None:
+    """A leader may answer before its devices have answered it, and does not publish when it accepts them."""
     network = MemoryNetwork()
-    rcm = Leader(network)
+    rcm = Leader(network, lambda: RcmState(TERM, 0, "anvil", rcs=listed))
     node = network.open("lab", Sender("cart", "node"))
     token = node.alive(Token("cart", Role.RC, SCOUT33, "i3"))
     async with recording(path, ears(network), rcm.mesh):
@@ -173,7 +176,11 @@ async def test_a_device_that_a_new_leader_does_not_list_yet_is_shown_as_free(pat
         rcm.mesh.put(rcm.mesh.keys.grants, grants(2))
         await asyncio.sleep(1)
     token.close()
-    assert [state for _, state in lanes(path, f"/devices/{SCOUT33}")[f"/devices/{SCOUT33}"]] == [[""], ["hide"], [""]]
+    assert [state for _, state in lanes(path, f"/devices/{SCOUT33}")[f"/devices/{SCOUT33}"]] == [
+        [shown],
+        ["hide"],
+        [shown],
+    ]
 
 
 async def test_a_device_that_two_hosts_offer_is_there_without_one_of_them_and_its_hold_goes_on(path: Path) -> None:

@@ -104,7 +104,7 @@ class RequestTracker:
         if (state.term, state.seq) < (self.term, self.seq):
             return False
         self.term, self.seq = state.term, state.seq
-        # A new leader may not list yet what is offered; that it takes it in is not published.
+        # Offered devices, too: a new leader may not list them yet, and does not publish when it accepts them.
         holders: dict[str, list[HoldView]] = {
             rc: [] for rc in (*(view.rc for view in state.rcs if view.present), *self._rcs, *self.offered)
         }
@@ -128,7 +128,7 @@ class RequestTracker:
         for view in state.rcs:
             if view.present:
                 self._absent.pop(view.rc, None)
-            elif view.rc in self._rcs:
+            elif view.rc in holders:
                 self._absent.setdefault(view.rc, "not there")
         for rc, held in holders.items():
             self._show(at, rc, held)
